@@ -72,32 +72,25 @@ class Alternatives(NamedTuple):
     log_prob: Array
     """(U, M): U tables of log probabilities; those out of a mode sum to 1. At the first sample all is in mode 0."""
     roots: Array
-    """(k, n, n): upper triangles G with G G' the covariance."""
-    which: Array
-    """(M, 2): the roots of the drift and of the event; -1 for none."""
-    column: Array
-    """(M, 2): which column of ``Problem.sizes`` multiplies either."""
+    """(E, n, n): upper triangles G with G G' the covariance of an event."""
+    adds: bool = False
+    """Whether the drift of event 0 happens too when there is another event."""
 
     def first(self) -> Array:
         """(U, E): the probabilities of the events out of mode 0."""
-        probs = np.zeros((len(self.log_prob), self.event.max() + 1))
+        probs = np.zeros((len(self.log_prob), len(self.roots)))
         for move in np.flatnonzero(self.source == 0):
             probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
         return probs
-
-    def moved(self) -> Array:
-        """(E, n) bool: which parameters an event moves."""
-        moved = np.zeros((self.event.max() + 1, self.roots.shape[1]), bool)
-        for label, (drift, own) in zip(self.event, self.which, strict=True):
-            moved[label] |= self.roots[own if own >= 0 else drift].any(axis=1)
-        return moved
 
     def moves(self, scale: Array, back: bool = False) -> Moves:
         """The same in one direction of time, for theta multiplied by ``scale``."""
         source, target = (self.target, self.source) if back else (self.source, self.target)
         order, modes = np.argsort(source, kind="stable"), max(source.max(), target.max()) + 1
         begin = np.searchsorted(source[order], np.arange(modes + 1))
-        kind = np.column_stack([target, self.event, self.which, self.column])[order].astype(np.int64)
+        own = np.where(self.event > 0, self.event, -1)
+        roots = (0 * own, own) if self.adds else (self.event, np.full_like(own, -1))
+        kind = np.column_stack([target, self.event, *roots])[order].astype(np.int64)
         return Moves(begin, kind, np.ascontiguousarray(self.log_prob[:, order]), self.roots * scale[:, None])
 
 
@@ -113,7 +106,7 @@ class Problem(NamedTuple):
     table: Array
     """(T,): which table of probabilities holds before each sample."""
     sizes: Array
-    """(T, C): factors of the roots before each sample."""
+    """(T, E): factors of the roots before each sample."""
     start: Array
     """(k, n + 1): information before the first sample, rows theta = value of variance 1."""
     noises: Noises
@@ -227,8 +220,9 @@ def step(
         for j in range(n):
             Q[i, j] = 0.0
     for which in range(2):
-        G, size = move[2 + which], sizes[move[4 + which]]
+        G = move[2 + which]
         if G >= 0:
+            size = sizes[G]
             for i in range(n):
                 for j in range(n):
                     for k in range(max(i, j), n):
@@ -268,7 +262,7 @@ def meet(
     Adds the probabilities of events to ``events``; the rows of ``out`` become the mean, those of the covariance, and
     mean and variance of the change at an event. Returns the log of the sum of all pairs.
     """
-    K, Y, more, row, work = len(X), room.children.A, room.children.facts, room.row, room.squares
+    K, Y, more, row, work = len(X), room.born, room.born_facts, room.row, room.squares
     n, top, total, moved = X.shape[1], -np.inf, 0.0, 0.0
     W, R, m, mean, cov = work[0], work[1, :, :n], work[1, :, n], out[0], out[1 : n + 1]
     for i in range(n + 3):
@@ -341,7 +335,7 @@ def backwards(
     for t in range(len(y) - 1, -1, -1):
         if last and t == len(y) - 1:
             C = K
-            room.children.A[:K], room.children.facts[:K] = now.A[:K], now.facts[:K]
+            room.born[:K], room.born_facts[:K] = now.A[:K], now.facts[:K]
         else:
             C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         X, facts = stored.A[t, : stored.many[t]], stored.facts[t]
@@ -458,10 +452,11 @@ class Passes:
         if not self.places:
             self.forward()
         T, n = self.problem.phi.shape
-        E = int(self.problem.alternatives.event.max()) + 1
+        roots = self.problem.alternatives.roots
+        E = len(roots)
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), self.keep, self.problem.alternatives.moved(),
+            np.zeros((T + 1, n)), np.empty(T), self.keep, roots.any(axis=2),
         )  # fmt: skip
         for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)

@@ -160,10 +160,9 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):
         log_prob = np.log([np.eye(1, len(roots))[0], [1.0 - PER_SAMPLE, *(PER_SAMPLE * p for _, p in jumps)]])
-    which = np.column_stack([zero, np.where(label > 0, label, -1)])
-    moves = Alternatives(zero, zero, label, log_prob, roots, which, np.tile([0, 1], (len(roots), 1)))
+    moves = Alternatives(zero, zero, label, log_prob, roots, adds=True)
     r = np.divide(1.0, walk.weight, out=np.full(T, np.inf), where=walk.weight > 0.0)
-    table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones(T)])
+    table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones((T, len(jumps)))])
     return Problem(
         walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), Noises(np.eye(1, 2), np.zeros((1, 1)))
     )

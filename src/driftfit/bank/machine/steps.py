@@ -31,10 +31,10 @@ from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
 from driftfit.bank.machine.advance import bank
 from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, read_framed, spans_lags
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
-from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
+from driftfit.engine.kernel import Array, State, Step, exp, floats, kernel, log, nothing
 from driftfit.trackers.forms.coordinates import FRAME, new_row, whiten_within
-from driftfit.trackers.forms.covariance import correct as correct_one
-from driftfit.trackers.forms.covariance import forecast as forecast_one
+from driftfit.trackers.forms.covariance import correct as correct_with_covariance
+from driftfit.trackers.forms.covariance import forecast as forecast_with_covariance
 from driftfit.trackers.forms.covariance import prediction
 from driftfit.trackers.forms.diffuse import (
     ENTERING,
@@ -170,12 +170,12 @@ def hand_over(s: State, l: int) -> None:
 
 
 @kernel
-def alone(s: State, l: int, counts: bool) -> None:
+def alone(s: State, l: int) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     residuals = s.count[l]
     s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
-    if counts:
+    if s.unknown[l] > 0 and s.s[l] < np.inf:
         learn_resolved_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
@@ -248,65 +248,6 @@ def correct_tree(s: State, l: int) -> None:
 
 
 @kernel
-def forecast(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.counters[COUNTER.settled, l] > 0:
-        forecast_tree(s, l)
-    else:
-        only_drift(s, l)
-        forecast_one(s, l)
-        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l])
-
-
-@kernel
-def correct(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        correct_tree(s, l)
-    else:
-        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-        correct_one(s, l)
-        alone(s, l, s.unknown[l] > 0)
-
-
-@kernel
-def read(s: State, l: int) -> None:
-    """theta and its variance from the mixture."""
-    if s.counters[COUNTER.framed, l] > 0:
-        read_framed(s, l)
-    else:
-        diagonal(s, l)
-
-
-@kernel
-def forecast_first(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.counters[COUNTER.settled, l] > 0:
-        forecast_tree(s, l)
-    else:
-        only_drifted(s, l)
-        forecast_on_roots(s, l)
-        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
-
-
-@kernel
-def correct_first(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        correct_tree(s, l)
-    else:
-        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-        correct_on_roots(s, l)
-        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-
-
-@kernel
-def read_first(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        read(s, l)
-    else:
-        spanned_variance(s, l)
-
-
-@kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
     """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
     row, column = t if known.shape[0] > 1 else 0, COMMON
@@ -318,9 +259,43 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(
-    no_own_sensor, forecast, correct, read, nothing,
-    start=TrackerSteps(no_own_sensor, forecast_first, correct_first, read_first, nothing),
+def led_by(drift: Step, forecast_one: Step, correct_one: Step, read_one: Step) -> TrackerSteps:
+    """The steps of a bank, and of a single filter with these steps before it begins."""
+
+    @kernel
+    def forecast(s: State, l: int) -> None:
+        resolve(s, l)
+        if s.counters[COUNTER.settled, l] > 0:
+            forecast_tree(s, l)
+        else:
+            drift(s, l)
+            forecast_one(s, l)
+            s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
+
+    @kernel
+    def correct(s: State, l: int) -> None:
+        if s.counters[COUNTER.settled, l] > 0:
+            correct_tree(s, l)
+        else:
+            s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+            correct_one(s, l)
+            alone(s, l)
+
+    @kernel
+    def read(s: State, l: int) -> None:
+        """theta and its variance from the mixture."""
+        if s.counters[COUNTER.settled, l] <= 0:
+            read_one(s, l)
+        elif s.counters[COUNTER.framed, l] > 0:
+            read_framed(s, l)
+        else:
+            diagonal(s, l)
+
+    return TrackerSteps(no_own_sensor, forecast, correct, read, nothing)
+
+
+STEPS = led_by(only_drift, forecast_with_covariance, correct_with_covariance, diagonal)._replace(
+    start=led_by(only_drifted, forecast_on_roots, correct_on_roots, spanned_variance),
     store=keep, read_extra=take_known, machines=(*FRAME, bank), outlined=True,
 )  # fmt: skip
 
