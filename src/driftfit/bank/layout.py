@@ -49,7 +49,8 @@ from typing import Any
 
 from numba import types
 
-from driftfit.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
+from driftfit.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, TableType
+from driftfit.bank.table import table_at as at
 from driftfit.engine.kernel import Array, kernel
 from driftfit.engine.tracker_part import open_at
 
@@ -124,19 +125,17 @@ BASES = ("memory", *(f"{name}_at" for name in OUTSIDE), *VARIABLES)
 shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
 PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
-TABLE = Table(
-    "bank",
-    {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)}
-    | {name: VECTOR for name in VECTORS} | {name: COUNTS for name in WHOLE} | OUTSIDE
-    | {name: NUMBER for name in NUMBERS} | {"packed": VECTOR},
-    BASES,
-    {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED} | {"packed": "W_at"},
-    VARIABLES,
-)  # fmt: skip
-ROW, ROWS = TABLE.row, len(TABLE.row)
+_FIELDS = {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)} | {name: VECTOR for name in VECTORS}
+_FIELDS |= {name: COUNTS for name in WHOLE} | {name: NUMBER for name in NUMBERS} | OUTSIDE | {"packed": VECTOR}
+_BASED = {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED} | {"packed": "W_at"}
+ROW = {field: row for row, field in enumerate((*_FIELDS, *BASES))}
+ROWS = len(ROW)
 """Rows of the table by the names of fields and bases, and how many there are."""
 MEMORY_AT, REPORT_AT, OUTPUT_LAGS = ROW["memory"], ROW["report_at"], ROW["output_lags"]
-table_at = TABLE.at
+table_at = at(TableType(
+    {name: (ROW[name], kind, ROW[_BASED.get(name, "memory")]) for name, kind in _FIELDS.items()},
+    {one: (ROW[base], kind, k) for base, (kind, names) in VARIABLES.items() for k, one in enumerate(names)},
+))  # fmt: skip
 """The table at an address, for compiled code."""
 
 

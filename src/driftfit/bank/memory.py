@@ -33,8 +33,8 @@ from driftfit.trackers.forms.diffuse import NOW, WORK
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
-ANSWERS = 3
-"""Numbers that a likelihood of the user's own returns for each leaf."""
+ANSWERS = 2
+"""Rows for the outputs that a likelihood of the user's own returns, and for all that it returns for one leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 

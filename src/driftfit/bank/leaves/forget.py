@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.bank.leaves.leaf_matrix import FIRST, spread
-from driftfit.engine.kernel import Array, exp, shared
+from driftfit.engine.kernel import Array, exp, part, shared
+from driftfit.engine.simd import WIDTH, fill, load, plus, store, times
 
 KEEP, RESET, KIND, GAIN = range(4)
 """Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an
@@ -185,6 +186,19 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
         renew(C, m, a, b, places[ANCHORS + c * n : ANCHORS + (c + 1) * n], places[MEAN], t.Q[c], t.spare_square)
 
 
+@part
+def predicted(n: int, t: Any, A: Array, K: int, c: int, C: Array, m: Array, to: int, work: Array) -> None:
+    """C- = C / forget + Q and m of K leaves of A under change c, in the columns of C and m from ``to`` on."""
+    keep, reset, Q, mean = fill(t.maps[c, KEEP]), t.maps[c, RESET] > 0.0, t.Q[c], t.places[MEAN]
+    for l in range(0, K, WIDTH):
+        for k in range(n * (n + 1) // 2):
+            store(C, k, to + l, plus(times(keep, load(A, FIRST + n + k, l)), fill(Q[k])))
+        for i in range(n):
+            store(m, i, to + l, fill(mean[i]) if reset else load(A, FIRST + i, l))
+    if t.maps[c, KIND] > 0.0:
+        apply(t, C, m, to, to + K, c, work)
+
+
 @shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean m and covariance C of every leaf over all changes, without data: the first two moments
@@ -210,13 +224,7 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
                 for l in range(L if Q[c, k] != 0.0 else 0):
                     C[k, l] += chance[l] * Q[c, k]
             continue
-        for k in range(tri):
-            for l in range(L):
-                one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
-        for i in range(n):
-            for l in range(L):
-                mean[i, l] = t.places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
-        apply(t, one, mean, 0, L, c, work)
+        predicted(n, t, B, L, c, one, mean, 0, work)
         for i in range(n):
             for l in range(L):
                 mean[i, l] -= B[FIRST + i, l]

@@ -82,29 +82,26 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """Evaluate the function for every leaf: log densities in the first row of `scores`, h + a in the place of h; h and
-    what the function returns as the output in the two rows of `answers`.
+    """Evaluate the function for every leaf: log densities in the first row of `scores`, noise variances in its last
+    row, and what the function returns as the output in the first row of `answers`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, because numbers are divided by
     it.
     """
-    h, kept, answer = t.expected[0], t.answers, t.answers[2]
+    clean, answer = t.answers[0], t.answers[1]
     for l in range(-(-columns // WIDTH) * WIDTH):
-        kept[0, l], answer[NOISE] = h[l], r
+        answer[NOISE] = r
         if l < columns:
             judge(t, which, at, l, y, r, answer)
-            t.scores[0, l], kept[1, l] = answer[LOG_P], answer[CLEAN]
-        h[l] += answer[NOISE]
+            t.scores[0, l], clean[l] = answer[LOG_P], answer[CLEAN]
+        t.scores[2, l] = answer[NOISE]
 
 
 @shared
-def restore(t: Any, at: int, columns: int, cleans: bool) -> None:
-    """Restore h; with ``cleans``, the output that the function returns is the newest lag."""
-    lags = lag_row(t)
-    for l in range(-(-columns // WIDTH) * WIDTH):
-        t.expected[0, l] = t.answers[0, l]
-    for l in range(columns if cleans else 0):
-        t.leaves[lags, at + l] = t.answers[1, l]
+def clean_lags(t: Any, at: int, columns: int) -> None:
+    """The output that the function returned is the newest lag."""
+    for l in range(columns):
+        t.leaves[lag_row(t), at + l] = t.answers[0, l]
 
 
 @kernel

@@ -29,7 +29,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.smooth.solvers.halves import BLOCK, Found, Samples, Sums, inwards, outwards, workspace
+from driftfit.smooth.solvers.halves import BLOCK, Found, Samples, inwards, outwards, workspace
 from driftfit.smooth.solvers.walk import Path, Walk
 
 ERROR = 1e-10
@@ -73,16 +73,16 @@ def smooth(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False)
     theta, var = (samples.signals, samples.phi) if overwrite else (np.empty((T, n)), np.empty((T, n)))
     of_fit = T if keep == "fit" else 0
     found = Found(theta, var, np.empty(of_fit), np.empty(of_fit))
-    sums = Sums(*outwards(work, samples, K, kept, found))
+    cost, measured, spread, doubtful = outwards(work, samples, K, kept, found)
     error = float((work["error"][0] * scale[:, None]).max())
-    if not (error <= ERROR and sums.doubtful == 0):
+    if not (error <= ERROR and doubtful == 0):
         return None
     empty = np.zeros((0, n, n))
     theta = np.ascontiguousarray(theta[:, :n])
     away = work["theta"][0, :, 0] - walk.theta0
-    cost = sums.cost + float(away @ before @ away)
+    cost += float(away @ before @ away)
     return Path(
-        theta, var, found.rho, found.c, cost, sums.measurement_cost, sums.spread, empty, empty, "fast",
+        theta, var, found.rho, found.c, cost, measured, spread, empty, empty, "fast",
         log_likelihood=-0.5 * (cost + volume),
     )  # fmt: skip
 

@@ -57,17 +57,6 @@ class Found(NamedTuple):
     c: Array
 
 
-class Sums(NamedTuple):
-    """What the loops add up on the way back."""
-
-    cost: float
-    measurement_cost: float
-    spread: float
-    """phi' C phi of the used samples."""
-    doubtful: int
-    """Samples of which 1 - h is too small, or a variance is not positive."""
-
-
 @lru_cache
 def workspace(n: int) -> Array:
     """Scratch space, to be copied: a record, so that the compiler knows n. The last axis is the half.
@@ -285,7 +274,11 @@ def back(s: State, i: int, row: int) -> Any:
 
 @Driver
 def outwards(work: Array, samples: Any, K: int, kept: Array, found: Any) -> tuple[float, float, float, int]:
-    """Run both halves back from theta and C of the middle in the scratch space; returns `Sums`."""
+    """Run both halves back from theta and C of the middle in the scratch space.
+
+    Returns the cost and the part of it that is measured, the sum of phi' C phi over the used samples, and the number of
+    samples of which 1 - h is too small, or a variance is not positive.
+    """
     s = work[0]
     n, T = s.q.shape[0], samples.phi.shape[0]
     moved, measured, spread, doubtful = same(0.0), 0.0, 0.0, 0

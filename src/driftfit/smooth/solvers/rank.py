@@ -11,9 +11,6 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.smooth.solvers.walk import WEIGHT
 from driftfit.trackers.forms import diffuse
 
-FAR = 1e250
-"""Sums of squares between this and its inverse have lost nothing to overflow or underflow."""
-
 
 def column_sizes(phi: Array, total: Any = np.mean) -> Array:
     """Root mean square (n,) of each column of phi (N, n), N > 0; 1 for columns of zeros, whose parameters are then 0.
@@ -37,21 +34,8 @@ def column_scale(phi: Array, signals: Array) -> Array:
         if signals[t, WEIGHT] > 0.0:
             count += 1
             for i in range(n):
-                squares[i] += phi[t, i] ** 2
-    ordinary = True
-    for i in range(n):
-        ordinary = ordinary and 1.0 / FAR < squares[i] < FAR
-        scale[i] = np.sqrt(squares[i] / count) if ordinary else 1.0
-    if ordinary:
-        return scale
-    # squares of very large or small numbers, or of zeros: in a unit in which the largest is about 1
-    for t in range(T):
-        if signals[t, WEIGHT] > 0.0:
-            for i in range(n):
                 top[i] = max(top[i], abs(phi[t, i]))
-    for i in range(n):
-        squares[i], scale[i] = 0.0, 1.0
-    for i in range(n):
+    for i in range(n):  # a unit in which the largest is about 1: squares neither overflow nor vanish
         if top[i] > 0.0:
             scale[i] = 2.0 ** -max(-1000.0, min(1000.0, np.floor(np.log2(top[i]))))  # exact in the products
     for t in range(T):
