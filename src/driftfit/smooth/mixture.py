@@ -179,17 +179,6 @@ class Samples(NamedTuple):
     keep: Array
 
 
-class Stored(NamedTuple):
-    """The components of the filter after each sample of a block."""
-
-    A: Array
-    facts: Array
-    many: Array
-    """(b - a,): their number."""
-    level: Array
-    """(b - a + 1,): logs of the factors taken out of the components, before and after each sample."""
-
-
 @shared
 def join(mean: Array, cov: Array, share: float, m: Array, R: Array, d: Array) -> None:
     """The moments of a mixture, with one more component N(m, R R') of this share."""
@@ -306,9 +295,11 @@ def meet(
 
 @Driver
 def forwards(
-    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, store: bool
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Filter, room: Room, store: bool
 ) -> None:  # fmt: skip
-    """The filter through a block of samples, whose components are stored if ``store`` says so."""
+    """The filter through a block of samples. With ``store`` it stores its components after each sample, and the levels
+    before and after it.
+    """
     phi, y, r, table, sizes, keep = samples
     K = now.many[0]
     stored.level[0] = now.level[0]
@@ -326,7 +317,7 @@ def forwards(
 
 @Driver
 def backwards(
-    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, last: bool, found: Mixture
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Filter, room: Room, last: bool, found: Mixture
 ) -> None:  # fmt: skip
     """The likelihood through a block, and where it meets the filter; ``last``: the record ends with the block."""
     phi, y, r, table, sizes, keep = samples
@@ -426,9 +417,10 @@ class Passes:
         self.behind.A[:S] = end
         self.behind.facts[:S, MODE], self.behind.facts[:S, SHARE] = np.arange(S), -n * np.log(unit)
         size = min(T, BLOCK)
-        self.stored = Stored(
-            np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1)
-        )
+        self.stored = Filter(
+            np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1),
+            np.zeros(0),
+        )  # fmt: skip
 
     def _block(self, a: int, which: int) -> Samples:
         return Samples(*(values[a : a + BLOCK] for values in self.samples[which]))

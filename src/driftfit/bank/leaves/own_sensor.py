@@ -5,8 +5,8 @@ noise variance a that the function returns,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so C remains a covariance whatever the function returns; a = inf is `LARGEST` times h + r. The function is compiled by
-itself, in a second or two, and the compiled routine of a bank calls it by its address (`call`), which a step has looked
+so C remains a covariance whatever the function returns; a = inf is `LARGEST_NOISE` times h + r. The function is compiled
+by itself, in a second or two, and the compiled routine of a bank calls it by its address (`call`), which a step has looked
 up by its symbol; the routine is not recompiled.
 """
 
@@ -26,7 +26,7 @@ from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
 
 OWN_AT = ROW["own_likelihoods"]
-LARGEST, LEAST = 1e12, 1e-12
+LARGEST_NOISE, LEAST_NOISE = 1e12, 1e-12
 """Limits of noise variances: at most this multiple of the forecast's variance, which has no effect, and at least this
 share of the nominal one.
 """
@@ -74,8 +74,8 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
     h = expected[0, l]
     readings = y + t.shift, expected[1, l] + t.shift
     call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.reading), answers.ctypes.data)
-    most = LARGEST * (h + r)
-    answers[NOISE] = max(answers[NOISE] / unit, LEAST * r) if answers[NOISE] < most * unit else most
+    most = LARGEST_NOISE * (h + r)
+    answers[NOISE] = max(answers[NOISE] / unit, LEAST_NOISE * r) if answers[NOISE] < most * unit else most
     answers[LOG_P] = answers[LOG_P] if answers[LOG_P] < np.inf else -np.inf
     answers[CLEAN] = answers[CLEAN] if abs(answers[CLEAN]) < np.inf else y
 

@@ -26,8 +26,8 @@ random walk that the tracker has estimated, squared as its drift ratio alpha^2 b
 
     log L = -1/2 sum (log f_t + min(e_t^2 / f_t, 16)),    e_t, f_t the innovations of a Kalman filter of level and slope
 
-that is compared with the one of the random walk, from the same filter and the same prior of the level, which is `FAR`
-standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record. Slopes are not
+that is compared with the one of the random walk, from the same filter and the same prior of the level, which is
+`LEVEL_STD` standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record. Slopes are not
 considered if one of `EQUAL_PARTS` parts of the record is all that speaks for them: it may be a jump or a fault.
 
 Source: West and Harrison, Bayesian Forecasting and Dynamic Models (1997), chapter 7, for the model and its likelihood.
@@ -46,7 +46,7 @@ from driftfit.smooth.solvers.walk import Path, Walk
 from driftfit.trackers.forms.information import triangular_root
 
 RATIOS = 10.0 ** np.arange(-10.0, -1.0)
-FAR = 100.0
+LEVEL_STD = 100.0
 LARGEST_SQUARE = 16.0
 """The largest e^2 / f that counts, so that a single sample decides nothing."""
 EQUAL_PARTS = 8
@@ -167,7 +167,7 @@ def compared(walk: Walk, trend: Array, start: Array) -> tuple[Array, Array]:
 
     def weigh(moves: Array, rate: Array) -> Array:
         total = np.zeros(EQUAL_PARTS)
-        m, wide = np.append(start * size, np.zeros(n)), np.append(np.full(n, FAR**2 * r), rate * trend.sum())
+        m, wide = np.append(start * size, np.zeros(n)), np.append(np.full(n, LEVEL_STD**2 * r), rate * trend.sum())
         log_likelihood(samples, moves, rate, trend, m, np.diag(wide), total)
         return total
 
