@@ -448,7 +448,7 @@ class Passes:
         E = len(roots)
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), self.keep, roots.any(axis=2),
+            np.zeros((T + 1, n)), np.empty(T), self.keep, np.asarray(roots.any(axis=2)),
         )  # fmt: skip
         for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)

@@ -27,8 +27,9 @@ random walk that the tracker has estimated, squared as its drift ratio alpha^2 b
     log L = -1/2 sum (log f_t + min(e_t^2 / f_t, 16)),    e_t, f_t the innovations of a Kalman filter of level and slope
 
 that is compared with the one of the random walk, from the same filter and the same prior of the level, which is
-`LEVEL_STD` standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record. Slopes are not
-considered if one of `EQUAL_PARTS` parts of the record is all that speaks for them: it may be a jump or a fault.
+`LEVEL_STD` standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record.
+Slopes are not considered if one of `EQUAL_PARTS` parts of the record is all that speaks for them: it may be a jump or a
+fault.
 
 Source: West and Harrison, Bayesian Forecasting and Dynamic Models (1997), chapter 7, for the model and its likelihood.
 Cost: O(T n^2) for each of the likelihoods.
