@@ -6,8 +6,8 @@ noise variance a that the function returns,
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
 so C remains a covariance whatever the function returns; a = inf is `LARGEST_NOISE` times h + r. The function is
-compiled by itself, in a second or two. The compiled routine of a bank calls it by its address (`call`), which a step has
-looked up by its symbol; the routine is not recompiled.
+compiled by itself, in a second or two. The compiled routine of a bank calls it by its address (`call`), which a step
+has looked up by its symbol; the routine is not recompiled.
 """
 
 from __future__ import annotations

@@ -31,10 +31,8 @@ from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
 from driftfit.bank.machine.advance import bank
 from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, read_framed, spans_lags
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
-from driftfit.engine.kernel import Array, State, Step, exp, floats, kernel, log, nothing
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
 from driftfit.trackers.forms.coordinates import FRAME, new_row, whiten_within
-from driftfit.trackers.forms.covariance import correct as correct_with_covariance
-from driftfit.trackers.forms.covariance import forecast as forecast_with_covariance
 from driftfit.trackers.forms.covariance import prediction
 from driftfit.trackers.forms.diffuse import (
     ENTERING,
@@ -43,11 +41,12 @@ from driftfit.trackers.forms.diffuse import (
     OK,
     WORK,
     Y,
-    correct_on_roots,
+    absorb_on_roots,
     forecast_on_roots,
     spanned_variance,
     wander,
 )
+from driftfit.trackers.forms.diffuse import hand_over as choose_form
 from driftfit.trackers.forms.excitation import learn_scales
 from driftfit.trackers.forms.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.mixture.states import LEAST_SHARE
@@ -69,20 +68,6 @@ def keep(o: State, s: State, l: int) -> None:
 @kernel
 def only_drift(s: State, l: int) -> None:
     """The time update by the first change, for the single filter before the bank starts."""
-    time = s.dt[l] * s.drift[l]
-    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
-    at = 0
-    for i in range(s.theta.shape[0]):
-        for j in range(i + 1):
-            s.P[i, j, l] = s.P[i, j, l] * keep + s.q0[at, l] * time
-            at += 1
-        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        s.P[i, i, l] += s.size0[i, l] * unit * time
-
-
-@kernel
-def only_drifted(s: State, l: int) -> None:
-    """The same in square-root form."""
     n = s.theta.shape[0]
     time = s.dt[l] * s.drift[l]
     root = exp(-0.5 * s.dt[l] * log(s.keep0[l]))
@@ -183,6 +168,8 @@ def alone(s: State, l: int) -> None:
     s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
     s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready:
+        choose_form(s, l)
     if ready and s.root[l] > 0:
         ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
         if ready:
@@ -259,44 +246,41 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-def led_by(drift: Step, forecast_one: Step, correct_one: Step, read_one: Step) -> TrackerSteps:
-    """The steps of a bank, and of a single filter with these steps before it begins."""
-
-    @kernel
-    def forecast(s: State, l: int) -> None:
-        resolve(s, l)
-        if s.counters[COUNTER.settled, l] > 0:
-            forecast_tree(s, l)
-        else:
-            drift(s, l)
-            forecast_one(s, l)
-            s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
-
-    @kernel
-    def correct(s: State, l: int) -> None:
-        if s.counters[COUNTER.settled, l] > 0:
-            correct_tree(s, l)
-        else:
-            s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-            correct_one(s, l)
-            alone(s, l)
-
-    @kernel
-    def read(s: State, l: int) -> None:
-        """theta and its variance from the mixture."""
-        if s.counters[COUNTER.settled, l] <= 0:
-            read_one(s, l)
-        elif s.counters[COUNTER.framed, l] > 0:
-            read_framed(s, l)
-        else:
-            diagonal(s, l)
-
-    return TrackerSteps(no_own_sensor, forecast, correct, read, nothing)
+@kernel
+def forecast(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.counters[COUNTER.settled, l] > 0:
+        forecast_tree(s, l)
+    else:
+        only_drift(s, l)
+        forecast_on_roots(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
 
 
-STEPS = led_by(only_drift, forecast_with_covariance, correct_with_covariance, diagonal)._replace(
-    start=led_by(only_drifted, forecast_on_roots, correct_on_roots, spanned_variance),
-    store=keep, read_extra=take_known, machines=(*FRAME, bank), outlined=True,
+@kernel
+def correct(s: State, l: int) -> None:
+    if s.counters[COUNTER.settled, l] > 0:
+        correct_tree(s, l)
+    else:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        absorb_on_roots(s, l)
+        alone(s, l)
+
+
+@kernel
+def read(s: State, l: int) -> None:
+    """theta and its variance from the mixture."""
+    if s.counters[COUNTER.settled, l] <= 0:
+        spanned_variance(s, l)
+    elif s.counters[COUNTER.framed, l] > 0:
+        read_framed(s, l)
+    else:
+        diagonal(s, l)
+
+
+STEPS = TrackerSteps(
+    no_own_sensor, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
+    outlined=True,
 )  # fmt: skip
 
 
@@ -306,6 +290,4 @@ def steps_of(own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
     if not own:
         return STEPS
     entry, point_out = entry_of(own)
-    assert STEPS.start is not None
-    start = STEPS.start._replace(predict=point_out)
-    return STEPS._replace(predict=point_out, start=start, machines=(*STEPS.machines, entry))
+    return STEPS._replace(predict=point_out, machines=(*STEPS.machines, entry))

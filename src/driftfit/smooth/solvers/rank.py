@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.smooth.solvers.walk import WEIGHT
-from driftfit.trackers.forms import diffuse
+from driftfit.trackers.forms.diffuse import ROW, WORK, outside, refresh, turn_in
 
 
 def column_sizes(phi: Array, total: Any = np.mean) -> Array:
@@ -52,30 +51,24 @@ def ranks(phi: Array, signals: Array, scale: Array) -> tuple[Array, Array]:
     n = len(scale)
     rank = np.full(len(phi), n, np.int16)
     S, R = np.zeros((n, n)), np.eye(n)
-    compiled_ranks()(S, R, np.zeros((diffuse.WORK, n)), phi, scale, signals, rank)
+    run_ranks(S, R, np.zeros((WORK, n)), phi, scale, signals, rank)
     return rank, R[:, np.diag(S) == 0.0]
 
 
-@lru_cache
-def compiled_ranks() -> Any:
-    refresh, outside, turn_in, row = diffuse.refresh, diffuse.outside, diffuse.turn_in, diffuse.ROW
-
-    @Driver
-    def run(S: Array, R: Array, work: Array, phi: Array, scale: Array, signals: Array, rank: Array) -> None:
-        n, known = len(scale), 0
-        scaled, values = np.empty(n), np.zeros(n)
-        for t in range(phi.shape[0]):
-            if known == n:
-                break
-            if signals[t, WEIGHT] > 0.0:
-                for i in range(n):
-                    scaled[i] = phi[t, i] / scale[i]
-                entering, _, _ = outside(scaled, S, work)
-                for i in range(n):
-                    work[row, i] = scaled[i]
-                turn_in(S, values, work[row], 0.0, entering)
-                refresh(S, R, work)
-                known += 1 if entering >= 0 else 0
-            rank[t] = known
-
-    return run
+@Driver
+def run_ranks(S: Array, R: Array, work: Array, phi: Array, scale: Array, signals: Array, rank: Array) -> None:
+    n, known = len(scale), 0
+    scaled, values = np.empty(n), np.zeros(n)
+    for t in range(phi.shape[0]):
+        if known == n:
+            break
+        if signals[t, WEIGHT] > 0.0:
+            for i in range(n):
+                scaled[i] = phi[t, i] / scale[i]
+            entering, _, _ = outside(scaled, S, work)
+            for i in range(n):
+                work[ROW, i] = scaled[i]
+            turn_in(S, values, work[ROW], 0.0, entering)
+            refresh(S, R, work)
+            known += 1 if entering >= 0 else 0
+        rank[t] = known
