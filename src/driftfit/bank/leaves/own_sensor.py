@@ -104,12 +104,6 @@ def clean_lags(t: Any, at: int, columns: int) -> None:
         t.leaves[lag_row(t), at + l] = t.answers[0, l]
 
 
-@kernel
-def no_own_sensor(s: State, l: int) -> None:
-    """Most banks have no functions of the user's."""
-    s.table[OWN_AT, 0, l] = 0
-
-
 @cache
 def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
     """The functions, numbered from 1, as a compiled routine; and the step that writes their address."""

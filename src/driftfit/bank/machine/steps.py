@@ -27,7 +27,7 @@ from driftfit.bank.layout import (
     report_at,
 )
 from driftfit.bank.leaves.lags import PLAUSIBLE
-from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
+from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of
 from driftfit.bank.machine.advance import bank
 from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, read_framed, spans_lags
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
@@ -279,7 +279,7 @@ def read(s: State, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    no_own_sensor, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
+    nothing, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
     outlined=True,
 )  # fmt: skip
 
