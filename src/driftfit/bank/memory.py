@@ -48,7 +48,7 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
     tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
-    more = 2 * na + (tri + 2 * n if forgets else 0)
+    more = 2 * na + (tri + n if forgets else 0)
     square = n * n if any(one.resets_some for one in bank.all_changes) else 0
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0

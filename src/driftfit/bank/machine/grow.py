@@ -56,7 +56,7 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
     if own:
         return int(develop_own(t, K))
     for c in range(len(t.walks)):
-        predicted(n, t, t.parents, K, c, t.C, t.m, c * K, t.from_g)
+        predicted(n, t, t.parents, K, c, t.C, t.m, c * K)
     return K * len(t.walks)
 
 
