@@ -31,9 +31,9 @@ from rich.table import Table
 from scipy.linalg import solveh_banded
 
 from driftfit import FLS, Kalman, Regression, track
-from driftfit.smooth.parts import elimination
-from driftfit.smooth.parts.halves import inwards, outwards
 from driftfit.smooth.problem import walk_of
+from driftfit.smooth.solvers import elimination
+from driftfit.smooth.solvers.halves import inwards, outwards
 
 N, MU = 4, 100.0
 

@@ -36,7 +36,7 @@ LAYERS = (
     ("models", "systems", "readings"),
     ("trackers", "bank", "models.hammerstein_wiener.extended_kalman", "models.hammerstein_wiener.output_error"),
     # the arithmetic of smoothers works on arrays and not on runs: a stream smooths its last samples with it
-    ("data", "smooth.parts"),
+    ("data", "smooth.solvers"),
     ("run",),
     # how tables and pictures of all results look, which each verb's result needs to print and draw itself
     ("show.text", "show.axes"),

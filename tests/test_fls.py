@@ -7,7 +7,7 @@ import pytest
 
 from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Walk
+from driftfit.smooth.solvers.walk import Walk
 
 
 def record(L=40, n=2, seed=0):

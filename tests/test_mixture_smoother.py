@@ -49,8 +49,8 @@ def enumerated(problem):
             continue
         prior = sum(moves.log_prob[problem.table[t], m] for t, m in enumerate(path))
         Q = []
-        for t, m in enumerate(path):
-            G = moves.roots[moves.which[m, 0]] * problem.sizes[t, moves.column[m, 0]]
+        for t, event in enumerate(moves.event[list(path)]):
+            G = moves.roots[event] * problem.sizes[t, event]
             Q.append(G @ G.T)
         for noise in product(range(len(noises.kind)), repeat=T):
             logs = prior + sum(noises.log_prob[s, l] for s, l in zip(modes[1:], noise, strict=True))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftfit import FLS, AdaptiveKalman, Kalman, Regression, track
-from driftfit.smooth.parts.slopes import log_likelihood
+from driftfit.smooth.solvers.slopes import log_likelihood
 
 T = 600
 

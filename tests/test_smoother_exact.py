@@ -8,7 +8,7 @@ from scipy.linalg import solveh_banded
 from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import DRIFT, WEIGHT, Walk, Y, room_for_signals
+from driftfit.smooth.solvers.walk import DRIFT, WEIGHT, Walk, Y, room_for_signals
 
 SIZES = [(1, 1), (1, 2), (1, 40), (2, 2), (2, 7), (2, 40), (4, 7), (4, 40)]
 MU = [1e-3, 0.1, 1.0, 30.0, 1e4]

@@ -21,7 +21,7 @@ from driftfit.show.plots import plot_track
 from driftfit.show.report import report
 from driftfit.show.summary import Summary, cell_of, summarise
 from driftfit.smooth.changes import changes
-from driftfit.smooth.smoothed import Smoothed, SmoothedShared
+from driftfit.smooth.smoothed import Smoothed
 from driftfit.tune import inference
 from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
@@ -100,8 +100,6 @@ class Track(result.Track, Exported, public=True):
         """
         if self.tracker.weighs and self.start is None:
             return Hypotheses(self.rows).smoothed
-        if self.rows_per_instant > 1:
-            return SmoothedShared.of_shared(self, keep, order_by, undetermined)
         return Smoothed.of(self, keep, order_by, undetermined)
 
     def changes(self, threshold: float = 0.5) -> list[Event]:

@@ -49,7 +49,7 @@ from driftfit.bank.leaves import forget
 from driftfit.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.bank.machine.advance import begin, limit_forgetting
 from driftfit.bank.machine.steps import steps_of
-from driftfit.bank.memory import SINGLE, arrays_of, packed
+from driftfit.bank.memory import SINGLE, arrays_of, outside, packed
 from driftfit.bank.prior import chains, events, per_sample
 from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.bank.sensor import Sensor
@@ -58,7 +58,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.forms.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
+from driftfit.trackers.forms.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing, take_root
 from driftfit.trackers.forms.excitation import not_learned, window
 from driftfit.trackers.forms.information import triangular_root
 from driftfit.trackers.forms.resolution import resolution, unresolved
@@ -252,7 +252,8 @@ class Bank(Tracker):
         if len(model.outputs) == 1 or model.shared:
             return state
         sizes = [np.size(state[name]) for name in ("memory", "report", "sample", "counters", "table")]
-        return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
+        sizes += [rows * columns for rows, columns in outside(model.n).values()]
+        return {**state, "flat": np.zeros(sum(sizes))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
         nominal = self.all_sensors[0]
@@ -267,17 +268,24 @@ class Bank(Tracker):
         sample = dict.fromkeys(SAMPLE._fields, 0.0) | {"reading": np.nan, "r": 1.0}
         sample["fade"] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTER._fields, 0))
+        again = isinstance(self.reduction, reductions.FirstFloor)  # which keeps samples in theta
         if self.p0 is not None and (nominal.r is not None or guessed):
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
             arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
-        again = isinstance(self.reduction, reductions.FirstFloor)  # which keeps samples in theta
-        q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
+        start: dict[str, Any] = (
+            dict(knowing_nothing(n, ALMOST_ANY if again else WORST)) if self.p0 is None else dict(knowing(n))
+        )
+        if self.p0 is not None and not leaf.settled:
+            start |= {"S": np.zeros((n, n)), "R": np.zeros((n, n)), "root": 1}
+            take_root.py_func(P0, start["R"], start["S"])
+            start["d"] = start["S"] @ theta0
+        Q0 = np.zeros((n, n))
         numbers = {
             "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self.independent,
             "apart": self._apart, "plain": na == 0,
         }  # fmt: skip
-        Q0[np.tril_indices(n)] = q0
+        Q0[np.tril_indices(n)] = arrays["walks"][0, : n * (n + 1) // 2]
         return {  # memory first, where a cache line begins
             **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
@@ -285,11 +293,11 @@ class Bank(Tracker):
             "scale": scale, "count": count, "squares": squares,
             "sample": np.array([getattr(leaf, name) for name in SAMPLE._fields]),
             "counters": np.array([getattr(leaf, name) for name in COUNTER._fields]), **unresolved(),
-            **(knowing_nothing(n, ALMOST_ANY if again else WORST) if self.p0 is None else knowing(n)),
-            "can_frame": int(not again), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            **start,
+            "can_frame": int(not again), "within": 0.0, "x": np.zeros(n),
             "column": -1,
-            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
-            "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
+            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)),
+            "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
 
@@ -322,7 +330,7 @@ class Bank(Tracker):
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        n, framed = len(p), bool(lane["framed"])
+        n, framed = len(p), bool(lane["counters"][COUNTER.framed])
         add = np.diag(p)
         if framed:
             np.einsum("ii->i", lane["P"])[:] += p
@@ -338,7 +346,7 @@ class Bank(Tracker):
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved by the same amount, so that the mixture is at the given value."""
-        name = "d" if lane["framed"] else "theta"
+        name = "d" if lane["counters"][COUNTER.framed] else "theta"
         before = lane[name].copy()
         super().place(lane, which, values)
         B = self._leaves(lane)

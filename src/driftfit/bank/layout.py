@@ -12,6 +12,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     slots                   a hash table for numbering groups
     prior                   p(next joint event | leaf), (H, leaves)
     walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
+    packed                  W as one row
     fixed_walks             `walks` for theta, where `machine.framed` writes `walks` in other coordinates
     fixed_places            `places` likewise
     lag_rows                for each output lag its coefficients as a function of z, and its value in the record
@@ -48,26 +49,28 @@ from typing import Any
 
 from numba import types
 
-from driftfit.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
+from driftfit.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, TableType
+from driftfit.bank.table import table_at as at
 from driftfit.engine.kernel import Array, kernel
 from driftfit.engine.tracker_part import open_at
 
 _Counters = namedtuple(
     "_Counters",
     "many_leaves settled open phase held clock impossible reported_to many_parents groups levels expanded stored "
-    "flipped taken chained alike wide parted looked",
+    "flipped taken chained alike wide parted looked framed",
 )
-COUNTER = _Counters(*range(20))
+COUNTER = _Counters(*range(21))
 """Whole numbers of a bank. ``settled`` is 1 once the tree grows, `WAITING` before, `READY` if it begins with the next
 sample; ``levels`` counts those of the tree. ``open`` levels have passed since the last used sample (`machine.gap`),
 ``taken`` steps of its interval are already in the table of a gap. Flags of the present sample: ``chained`` if the user
 gave a chain of changes, ``alike`` if all leaves have the same prior, ``wide`` if its level is not that of one nominal
 interval, ``parted`` if leaves are continued as two (`machine.markov_gap`), ``expanded`` if histories are those of the
 leaves and not of their parents. ``phase`` says what the routine is called for, ``looked`` for which kind of sample its
-forecast was.
+forecast was. ``framed`` is 1 in the coordinates of `machine.framed`.
 """
 WAITING, READY = 0, -1
-LEARN, FORECAST = 0, 1
+LEARN, FORECAST, ENTER, ENTER_NEW = range(4)
+"""Phases. A sample with which a coordinate enters is learned by all leaves, its coordinate known before or `NEW`."""
 _Sample = namedtuple(
     "_Sample",
     "y noise dt time ok observed r fade least most y_hat s squares times elapsed freedom shift reading unit last "
@@ -102,8 +105,11 @@ WINDOWS = (
     "z", "from_C", "C", "m", "g", "from_g", "expected", "scores", "spare", "spare_lags", "lag_coefficients", "answers",
 )  # fmt: skip
 """Rows of the scratch that have names."""
-OUTSIDE = {"report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX}
-"""Arrays that are fields of the state themselves."""
+OUTSIDE = {"report": VECTOR, "phi": VECTOR, "c": VECTOR, "theta": VECTOR, "cov": MATRIX, "S": MATRIX, "R": MATRIX}
+OUTSIDE |= {"H": MATRIX, "W": MATRIX, "work": MATRIX, "at_start": VECTOR}
+"""Arrays that are fields of the state themselves: the report, the sample, the mean squares of its regressors, the
+mixture, and those of the coordinates of the start (`driftfit.trackers.forms.coordinates`).
+"""
 VARIABLES = {"counters_at": (types.int64, COUNTER._fields), "sample_at": (types.float64, SAMPLE._fields)}
 """Names of single numbers, by the base of the field in which they lie."""
 NUMBERS = (
@@ -119,19 +125,17 @@ BASES = ("memory", *(f"{name}_at" for name in OUTSIDE), *VARIABLES)
 shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
 PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
-TABLE = Table(
-    "bank",
-    {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)}
-    | {name: VECTOR for name in VECTORS} | {name: COUNTS for name in WHOLE} | OUTSIDE
-    | {name: NUMBER for name in NUMBERS},
-    BASES,
-    {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED},
-    VARIABLES,
-)  # fmt: skip
-ROW, ROWS = TABLE.row, len(TABLE.row)
+_FIELDS = {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)} | {name: VECTOR for name in VECTORS}
+_FIELDS |= {name: COUNTS for name in WHOLE} | {name: NUMBER for name in NUMBERS} | OUTSIDE | {"packed": VECTOR}
+_BASED = {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED} | {"packed": "W_at"}
+ROW = {field: row for row, field in enumerate((*_FIELDS, *BASES))}
+ROWS = len(ROW)
 """Rows of the table by the names of fields and bases, and how many there are."""
-MEMORY_AT, REPORT_AT = ROW["memory"], ROW["report_at"]
-table_at = TABLE.at
+MEMORY_AT, REPORT_AT, OUTPUT_LAGS = ROW["memory"], ROW["report_at"], ROW["output_lags"]
+table_at = at(TableType(
+    {name: (ROW[name], kind, ROW[_BASED.get(name, "memory")]) for name, kind in _FIELDS.items()},
+    {one: (ROW[base], kind, k) for base, (kind, names) in VARIABLES.items() for k, one in enumerate(names)},
+))  # fmt: skip
 """The table at an address, for compiled code."""
 
 

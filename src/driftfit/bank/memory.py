@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.layout import HEAD, MEMORY_AT, MOST_REPORTED, PACKED, REPORT_AT, REPORTED, ROW, ROWS, SAMPLE_HEAD
+from driftfit.bank.layout import (
+    HEAD,
+    MEMORY_AT,
+    MOST_REPORTED,
+    OUTSIDE,
+    PACKED,
+    REPORT_AT,
+    REPORTED,
+    ROW,
+    ROWS,
+    SAMPLE_HEAD,
+)
 from driftfit.bank.leaves import forget
 from driftfit.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.bank.leaves.leaf_matrix import FIRST
@@ -15,13 +26,15 @@ from driftfit.bank.machine.ancestry import news_of
 from driftfit.bank.machine.gap import SINCE
 from driftfit.bank.reducing import selection
 from driftfit.bank.sensor import table_of
+from driftfit.bank.table import VECTOR
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.forms.diffuse import NOW, WORK
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
-ANSWERS = 3
-"""Numbers that a likelihood of the user's own returns for each leaf."""
+ANSWERS = 2
+"""Rows for the outputs that a likelihood of the user's own returns, and for all that it returns for one leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -35,7 +48,7 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
     tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
-    more = 2 * na + (tri + 2 * n if forgets else 0)
+    more = 2 * na + (tri + n if forgets else 0)
     square = n * n if any(one.resets_some for one in bank.all_changes) else 0
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
@@ -82,6 +95,12 @@ def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Arra
     }  # fmt: skip
 
 
+def outside(n: int) -> dict[str, tuple[int, int]]:
+    """Rows and columns of the fields of the state that the routine reads itself, but for the report."""
+    shapes = {name: (1, n) if kind == VECTOR else (n, n) for name, kind in OUTSIDE.items() if name != "report"}
+    return shapes | {"work": (WORK, n), "at_start": (1, NOW)}
+
+
 def _named_rows(n: int) -> int:
     """Rows of the scratch before its scores."""
     return n * (n + 1) // 2 + 3 * n + 2
@@ -115,9 +134,8 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     start, rows, columns = table[ROW["scratch"]]
     for name, (first, count) in windows(n, na, rows).items():
         table[ROW[name]] = start + 8 * first * columns, count, columns
-    for name in ("phi", "powers", "theta"):
-        table[ROW[name]] = 0, 1, n
-    table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)
+    for name, shape in {**outside(n), "packed": (1, n * n), "report": (1, HEAD)}.items():
+        table[ROW[name]] = 0, *shape
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
     memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))

@@ -64,30 +64,26 @@ def events(
     ``transition`` is None (independent), the matrix of the changes, of the sensors if there is only one change, of
     the joint events, or a pair (changes, sensors) in which None is independent.
     """
-    Hd, Hm = len(changes), len(sensors)
-    chains = None
-    if transition is not None:
-        chains = _chains(owner, transition, Hd, Hm)
-        if isinstance(chains, np.ndarray):
-            return chains, _initial(owner, initial, chains)
+    found = _chains(owner, transition, len(changes), len(sensors))
+    if isinstance(found, np.ndarray):
+        return found, _initial(owner, initial, found)
     parts, starts = [], []
     given: Sequence[Any]
-    for which, (what, given) in enumerate((("changes", changes), ("sensors", sensors))):
-        size = len(given)
-        if chains is not None and chains[which] is not None:
-            P = rows(owner, chains[which], size, what)
-            starts.append(stationary(P))
+    for what, given, chain in zip(("changes", "sensors"), (changes, sensors), found, strict=True):
+        if chain is None:
+            starts.append(shares(owner, what, given))
+            parts.append(np.tile(starts[-1], (len(given), 1)))
         else:
-            p = shares(owner, what, given)
-            P = np.tile(p, (size, 1))
-            starts.append(p)
-        parts.append(P)
+            parts.append(rows(owner, chain, len(given), what))
+            starts.append(stationary(parts[-1]))
     P = np.kron(*parts)
     return P, np.kron(*starts) if initial is None else _initial(owner, initial, P)
 
 
 def _chains(owner: str, transition: Any, Hd: int, Hm: int) -> Any:
     """The joint matrix, or a pair of matrices in which None is independent."""
+    if transition is None:
+        return None, None
     pair = isinstance(transition, tuple | list) and len(transition) == 2 and (
         any(part is None for part in transition) or all(np.ndim(part) == 2 for part in transition)
     )  # fmt: skip

@@ -20,7 +20,7 @@ REMEMBERED = 24
 """Number of past levels of the tree that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four
 hundred samples, twenty times, 25 of 40 were found with 8 levels, 37 with 16, and 40 with 24.
 """
-MOST = 4096
+MOST_UPDATES = 4096
 """Largest number of leaf updates per sample; a larger tree raises an error."""
 
 
@@ -68,9 +68,10 @@ def knobs(kind: int, **values: float) -> Array:
 
 def tree(owner: str, H: int, depth: int, instead: str) -> int:
     """H^depth, or ValueError if a step cannot afford it."""
-    if H**depth > MOST:
+    if H**depth > MOST_UPDATES:
         raise ValueError(
-            f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates per sample, more than {MOST}; {instead}."
+            f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates per sample, more than {MOST_UPDATES}; "
+            f"{instead}."
         )
     return int(H**depth)
 

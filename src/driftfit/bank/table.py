@@ -1,10 +1,10 @@
 """A table: dozens of arrays and numbers behind one address, as the one argument of the parts of a compiled routine.
 
-    TABLE = Table("bank", {"leaves": MATRIX, "group": COUNTS, "n": NUMBER, ..}, bases=("memory", "report"), ..)
+    at = table_at(TableType({"leaves": (0, MATRIX, 2), "n": (1, NUMBER, 2), ..}, {"clock": (3, types.int64, 0), ..}))
 
-Row k of a table is that of the k-th field: an offset in bytes, rows, columns; the first column of a number holds the
-number. The offsets of arrays count from the address in the row of their base. In compiled code
-``t = TABLE.at(address)`` gives the table, ``t.leaves`` an array, and ``t.clock += 1`` counts in a variable, which is an
+A row of a table is that of a field: an offset in bytes, rows, columns; the first column of a number holds the number.
+The offsets of arrays count from the address in the row of their base. In compiled code ``t = at(address)`` gives the
+table, ``t.leaves`` an array, and ``t.clock += 1`` counts in a variable, which is an
 entry of an array of variables. Rows do not change while compiled code runs, so the compiler reads each once.
 
 Passing the arrays themselves costs the compiler most of its time: each one is nine values, of every call on the way.
@@ -30,13 +30,15 @@ _KINDS = {
 
 
 class TableType(types.Type):
-    """A table, as the compiler sees it."""
+    """A table, as the compiler sees it: (row, kind, row of the base) of each field; (row of the base, type, place) of
+    each variable.
+    """
 
-    def __init__(self, name: str, rows: Mapping[str, Any], variables: Mapping[str, Any]) -> None:
+    def __init__(self, rows: Mapping[str, Any], variables: Mapping[str, Any]) -> None:
         self.rows, self.variables = dict(rows), dict(variables)
         text = f"{self.rows}{self.variables}"  # which is 4 kB of every symbol
         digest = hashlib.sha256(text.encode()).hexdigest()
-        super().__init__(name=f"driftfit.Table({name}, {digest[:16]})")
+        super().__init__(name=f"driftfit.Table({digest[:16]})")
 
 
 @register_model(TableType)
@@ -82,36 +84,13 @@ def _write(context: Any, builder: Any, signature: Any, given: Any, name: str) ->
     builder.store(given[1], _variable(context, builder, signature.args[0], given[0], name))
 
 
-class Table:
-    """The fields of a table: their kinds and rows, and the intrinsic that returns a table at an address.
+def table_at(kind: TableType) -> Any:
+    """The intrinsic that returns the table at an address."""
 
-    ``based`` maps fields to their base if it is not the first one; ``variables`` maps bases to the names of the
-    variables that lie there, whole numbers or not.
-    """
+    def typed(context: Any, address: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return builder.inttoptr(given[0], WORD.as_pointer())
 
-    def __init__(
-        self,
-        name: str,
-        fields: Mapping[str, str],
-        bases: tuple[str, ...],
-        based: Mapping[str, str],
-        variables: Mapping[str, tuple[Any, tuple[str, ...]]],
-    ) -> None:
-        places = (*fields, *bases)
-        self.row = {field: row for row, field in enumerate(places)}
-        """Rows by the names of fields and bases."""
-        rows = {field: (self.row[field], kind, self.row[based.get(field, bases[0])]) for field, kind in fields.items()}
-        entries = {
-            one: (self.row[base], kind, place)
-            for base, (kind, names) in variables.items()
-            for place, one in enumerate(names)
-        }
-        kind = TableType(name, rows, entries)
+        return kind(types.intp), build
 
-        def typed(context: Any, address: Any) -> Any:
-            def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-                return builder.inttoptr(given[0], WORD.as_pointer())
-
-            return kind(types.intp), build
-
-        self.at = named_intrinsic(kind.name, typed)
+    return named_intrinsic(kind.name, typed)

@@ -14,7 +14,7 @@ from driftfit.judge.statistics.coarse_readings import step_of
 from driftfit.judge.statistics.robust import orthonormal, sole
 from driftfit.models.base import Model
 from driftfit.run.result import Track, burn_in
-from driftfit.smooth.parts.rank import column_sizes
+from driftfit.smooth.solvers.rank import column_sizes
 
 
 class Rows(NamedTuple):

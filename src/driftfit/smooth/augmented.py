@@ -28,8 +28,8 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import numbers, one_of, vector, whole
 from driftfit.run.result import Track
 from driftfit.smooth.exact import smooth
-from driftfit.smooth.parts.walk import WEIGHT, Y, constants
 from driftfit.smooth.problem import walk_of
+from driftfit.smooth.solvers.walk import WEIGHT, Y, constants
 from driftfit.trackers.augmented_fls import AugmentedFLS
 
 

@@ -5,10 +5,10 @@ It minimises the following cost, and computes the corresponding posterior distri
     J = sum_t weight_t (y_t - phi_t' theta_t)^2 + sum_t |G^-1 E_t^-1 (theta_t - theta_{t-1})|^2 / drift_t + prior
 
 with G G' = q and E_t the square roots of the factors of each parameter's drift. There are two methods. The fast one
-(`driftfit.smooth.parts.elimination`) handles a diagonal q if the regressors span all directions, also with a proper
+(`driftfit.smooth.solvers.elimination`) handles a diagonal q if the regressors span all directions, also with a proper
 prior, and tests its own result by a second problem with a known solution. If the test fails, and in all other cases,
-the safe one (`driftfit.smooth.parts.two_filters`) works on square roots of information. ``Path.method`` names the
-method that was used. Second differences instead of first ones are in `driftfit.smooth.parts.slopes`.
+the safe one (`driftfit.smooth.solvers.two_filters`) works on square roots of information. ``Path.method`` names the
+method that was used. Second differences instead of first ones are in `driftfit.smooth.solvers.slopes`.
 
 If the regressors never span all directions, a constant shift in the complement costs nothing. The first point then
 takes theta0 there, the limit of a vanishing prior, and std is inf for parameters that are not determined. Rank is
@@ -27,9 +27,9 @@ from collections.abc import Callable
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.smooth.parts import elimination, slopes, two_filters
-from driftfit.smooth.parts.rank import column_scale, ranks
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.solvers import elimination, slopes, two_filters
+from driftfit.smooth.solvers.rank import column_scale, ranks
+from driftfit.smooth.solvers.walk import Path, Walk
 from driftfit.trackers.forms.information import triangular_root
 
 

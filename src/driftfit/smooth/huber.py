@@ -25,9 +25,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import WEIGHT, Path, Walk
 from driftfit.smooth.problem import walk_of
 from driftfit.smooth.smoothed import Data, Smoothed
+from driftfit.smooth.solvers.walk import WEIGHT, Path, Walk
 
 EFFICIENT = 1.345
 """delta in standard deviations: 95 % efficiency on Gaussian residuals."""

@@ -18,8 +18,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.smooth.parts.walk import Path
 from driftfit.smooth.problem import replay
+from driftfit.smooth.solvers.walk import Path
 from driftfit.trackers.forms.volatility import smoothed_noise
 from driftfit.trackers.laws.law import OWNER, VISIBLE, transition
 

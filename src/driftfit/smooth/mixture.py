@@ -4,7 +4,8 @@
     y_t = phi_t' theta_t + v_t,    v_t ~ N(offset_l, r_t factor_l) with the probability of noise l in mode s
 
 One filter goes forwards through p(theta_t, s_t | y_1 .. y_t), another backwards through p(y_t .. y_T | theta_t, s_t).
-Both are sums of Gaussians (`driftfit.smooth.parts.components`) and run the same routine. Between t and t + 1 they meet,
+Both are sums of Gaussians (`driftfit.smooth.solvers.components`) and run the same routine. Between t and t + 1 they
+meet,
 
     p(theta_t, i, m, j | y)  proportional to  F_i(theta_t) p_m integral N(w; 0, Q_m) B_j(theta_t + w) dw
 
@@ -25,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.smooth.parts.components import (
+from driftfit.smooth.solvers.components import (
     COST,
     LOG,
     MODE,
@@ -47,11 +48,11 @@ from driftfit.smooth.parts.components import (
     reduce,
     room_for,
 )
-from driftfit.smooth.parts.rank import column_sizes
+from driftfit.smooth.solvers.rank import column_sizes
 
 BLOCK = 1000
 """Samples between checkpoints."""
-MOST = 48
+MOST_COMPONENTS = 48
 """Components that are kept at most, where the evidence is not constant; `ROOMY` elsewhere."""
 NEAR = 16
 """Samples to either side of such a place that get more components."""
@@ -71,32 +72,25 @@ class Alternatives(NamedTuple):
     log_prob: Array
     """(U, M): U tables of log probabilities; those out of a mode sum to 1. At the first sample all is in mode 0."""
     roots: Array
-    """(k, n, n): upper triangles G with G G' the covariance."""
-    which: Array
-    """(M, 2): the roots of the drift and of the event; -1 for none."""
-    column: Array
-    """(M, 2): which column of ``Problem.sizes`` multiplies either."""
+    """(E, n, n): upper triangles G with G G' the covariance of an event."""
+    adds: bool = False
+    """Whether the drift of event 0 happens too when there is another event."""
 
     def first(self) -> Array:
         """(U, E): the probabilities of the events out of mode 0."""
-        probs = np.zeros((len(self.log_prob), self.event.max() + 1))
+        probs = np.zeros((len(self.log_prob), len(self.roots)))
         for move in np.flatnonzero(self.source == 0):
             probs[:, self.event[move]] += np.exp(self.log_prob[:, move])
         return probs
-
-    def moved(self) -> Array:
-        """(E, n) bool: which parameters an event moves."""
-        moved = np.zeros((self.event.max() + 1, self.roots.shape[1]), bool)
-        for label, (drift, own) in zip(self.event, self.which, strict=True):
-            moved[label] |= self.roots[own if own >= 0 else drift].any(axis=1)
-        return moved
 
     def moves(self, scale: Array, back: bool = False) -> Moves:
         """The same in one direction of time, for theta multiplied by ``scale``."""
         source, target = (self.target, self.source) if back else (self.source, self.target)
         order, modes = np.argsort(source, kind="stable"), max(source.max(), target.max()) + 1
         begin = np.searchsorted(source[order], np.arange(modes + 1))
-        kind = np.column_stack([target, self.event, self.which, self.column])[order].astype(np.int64)
+        own = np.where(self.event > 0, self.event, -1)
+        roots = (0 * own, own) if self.adds else (self.event, np.full_like(own, -1))
+        kind = np.column_stack([target, self.event, *roots])[order].astype(np.int64)
         return Moves(begin, kind, np.ascontiguousarray(self.log_prob[:, order]), self.roots * scale[:, None])
 
 
@@ -112,7 +106,7 @@ class Problem(NamedTuple):
     table: Array
     """(T,): which table of probabilities holds before each sample."""
     sizes: Array
-    """(T, C): factors of the roots before each sample."""
+    """(T, E): factors of the roots before each sample."""
     start: Array
     """(k, n + 1): information before the first sample, rows theta = value of variance 1."""
     noises: Noises
@@ -170,7 +164,7 @@ class Mixture(NamedTuple):
         more = self.kept.copy()
         for t in np.flatnonzero(self.uneven):
             near = slice(max(t - NEAR, 0), t + NEAR)
-            more[near] = np.minimum(4 * self.kept[near], MOST)
+            more[near] = np.minimum(4 * self.kept[near], MOST_COMPONENTS)
         return more
 
 
@@ -183,17 +177,6 @@ class Samples(NamedTuple):
     table: Array
     sizes: Array
     keep: Array
-
-
-class Stored(NamedTuple):
-    """The components of the filter after each sample of a block."""
-
-    A: Array
-    facts: Array
-    many: Array
-    """(b - a,): their number."""
-    level: Array
-    """(b - a + 1,): logs of the factors taken out of the components, before and after each sample."""
 
 
 @shared
@@ -226,8 +209,9 @@ def step(
         for j in range(n):
             Q[i, j] = 0.0
     for which in range(2):
-        G, size = move[2 + which], sizes[move[4 + which]]
+        G = move[2 + which]
         if G >= 0:
+            size = sizes[G]
             for i in range(n):
                 for j in range(n):
                     for k in range(max(i, j), n):
@@ -267,7 +251,7 @@ def meet(
     Adds the probabilities of events to ``events``; the rows of ``out`` become the mean, those of the covariance, and
     mean and variance of the change at an event. Returns the log of the sum of all pairs.
     """
-    K, Y, more, row, work = len(X), room.children.A, room.children.facts, room.row, room.squares
+    K, Y, more, row, work = len(X), room.born, room.born_facts, room.row, room.squares
     n, top, total, moved = X.shape[1], -np.inf, 0.0, 0.0
     W, R, m, mean, cov = work[0], work[1, :, :n], work[1, :, n], out[0], out[1 : n + 1]
     for i in range(n + 3):
@@ -311,9 +295,11 @@ def meet(
 
 @Driver
 def forwards(
-    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, store: bool
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Filter, room: Room, store: bool
 ) -> None:  # fmt: skip
-    """The filter through a block of samples, whose components are stored if ``store`` says so."""
+    """The filter through a block of samples. With ``store`` it stores its components after each sample, and the levels
+    before and after it.
+    """
     phi, y, r, table, sizes, keep = samples
     K = now.many[0]
     stored.level[0] = now.level[0]
@@ -331,7 +317,7 @@ def forwards(
 
 @Driver
 def backwards(
-    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Stored, room: Room, last: bool, found: Mixture
+    samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Filter, room: Room, last: bool, found: Mixture
 ) -> None:  # fmt: skip
     """The likelihood through a block, and where it meets the filter; ``last``: the record ends with the block."""
     phi, y, r, table, sizes, keep = samples
@@ -340,7 +326,7 @@ def backwards(
     for t in range(len(y) - 1, -1, -1):
         if last and t == len(y) - 1:
             C = K
-            room.children.A[:K], room.children.facts[:K] = now.A[:K], now.facts[:K]
+            room.born[:K], room.born_facts[:K] = now.A[:K], now.facts[:K]
         else:
             C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         X, facts = stored.A[t, : stored.many[t]], stored.facts[t]
@@ -362,8 +348,8 @@ def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | N
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
 
     ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. The filter
-    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST`; see
-    `Mixture.needed`.
+    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST_COMPONENTS`
+    (`Mixture.needed`).
     """
     if isinstance(problem, Passes):
         passes = problem
@@ -431,9 +417,10 @@ class Passes:
         self.behind.A[:S] = end
         self.behind.facts[:S, MODE], self.behind.facts[:S, SHARE] = np.arange(S), -n * np.log(unit)
         size = min(T, BLOCK)
-        self.stored = Stored(
-            np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1)
-        )
+        self.stored = Filter(
+            np.zeros((size, most, n, n + 1)), np.zeros((size, most, 5)), np.zeros(size, np.int64), np.zeros(size + 1),
+            np.zeros(0),
+        )  # fmt: skip
 
     def _block(self, a: int, which: int) -> Samples:
         return Samples(*(values[a : a + BLOCK] for values in self.samples[which]))
@@ -457,10 +444,11 @@ class Passes:
         if not self.places:
             self.forward()
         T, n = self.problem.phi.shape
-        E = int(self.problem.alternatives.event.max()) + 1
+        roots = self.problem.alternatives.roots
+        E = len(roots)
         found = Mixture(
             np.empty((T, n)), np.empty((T, n, n if covariances else 1)), np.zeros((T + 1, E)), np.zeros((T + 1, n)),
-            np.zeros((T + 1, n)), np.empty(T), self.keep, self.problem.alternatives.moved(),
+            np.zeros((T + 1, n)), np.empty(T), self.keep, np.asarray(roots.any(axis=2)),
         )  # fmt: skip
         for a, place in reversed([*zip(range(0, T, BLOCK), self.places, strict=True)]):
             here, after = slice(a, min(a + BLOCK, T)), slice(a + 1, min(a + BLOCK, T) + 1)

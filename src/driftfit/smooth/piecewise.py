@@ -20,9 +20,9 @@ from driftfit.bank.results.results import Hypotheses
 from driftfit.bank.results.smoothed import faulty
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.smooth.parts.rank import column_sizes
 from driftfit.smooth.plots import plot_segments
 from driftfit.smooth.problem import replay
+from driftfit.smooth.solvers.rank import column_sizes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

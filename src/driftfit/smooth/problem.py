@@ -1,4 +1,4 @@
-"""The problem behind a run, for smoothers: see `driftfit.smooth.parts.walk`.
+"""The problem behind a run, for smoothers: see `driftfit.smooth.solvers.walk`.
 
 The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
 once to collect them.
@@ -6,18 +6,17 @@ once to collect them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, Driver, State, kernel
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.smooth.parts.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
+from driftfit.smooth.solvers.walk import DRIFT, NONE, WEIGHT, Walk, Y, free, room_for_signals
 from driftfit.smooth.unknown_drift import average_drift
 from driftfit.trackers.base import RandomWalk
 
@@ -91,24 +90,11 @@ def collected(run: Track) -> tuple[Array, Array, dict[str, Array]]:
     phi, signals = np.empty((len(run), run.model.n)), room_for_signals(len(run), run.model.n)
     found: dict[str, Array] = {}
     for first, rows in blocks(run):
-        fields: Mapping[str, Any] = rows.dtype.fields or {}
-        places = [fields[name][1] // 8 for name in ("phi", "y", "used_noise", "ok", "dt")]
-        take(rows.view(np.float64).reshape(len(rows), -1), *places, phi[first:], signals[first:])
+        part, row = slice(first, first + len(rows)), {name: rows[name][..., 0] for name in rows.dtype.names or ()}
+        phi[part], signals[part, Y], signals[part, DRIFT] = row["phi"], row["y"], row["dt"]
+        signals[part, WEIGHT] = np.where(row["ok"] > 0.0, 1.0 / row["used_noise"], 0.0)
         put_in_place(rows, found, ("e", *own) if own else (), first, len(run))
     return phi, signals, {name: values[..., 0] for name, values in found.items()}
-
-
-@Driver
-def take(
-    rows: Array, at_phi: int, at_y: int, at_noise: int, at_ok: int, at_dt: int, phi: Array, signals: Array
-) -> None:
-    """Copy columns of a block to phi and signals."""
-    for t in range(rows.shape[0]):
-        for i in range(phi.shape[1]):
-            phi[t, i] = rows[t, at_phi + i]
-        signals[t, Y] = rows[t, at_y]
-        signals[t, WEIGHT] = 1.0 / rows[t, at_noise] if rows[t, at_ok] > 0.0 else 0.0
-        signals[t, DRIFT] = rows[t, at_dt]
 
 
 def walk_of(run: Track, prior: RandomWalk | None = None, turned: bool = False) -> Walk:

@@ -15,11 +15,13 @@ from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run.result import Track
 from driftfit.smooth import exact, laws
-from driftfit.smooth.parts.walk import NONE, Path, Walk, ordered
 from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
+from driftfit.smooth.solvers.walk import NONE, Path, Walk, ordered
 from driftfit.use.blocks import blocks_of
 
+PER_SAMPLE = ("theta", "var", "rank", "slope", "slope_var", "cov", "lag_cov")
+"""Arrays of a path that outputs which share one theta have once for each instant."""
 ALONE = 1e-12
 """Below this sqrt(1 - leverage) a sample alone determines a direction, and its leave-one-out residual is undefined."""
 
@@ -84,21 +86,20 @@ class Smoothed:
     Only theta, std and rank are kept. The first of residual, loo, leverage, press, alone and weight that is read
     solves the problem again, and keeps (T,) numbers for all of them; keep="fit" of `Track.smooth` has them at once.
 
+    Of ny outputs that share one theta, rows of one instant are successive samples between which theta does not move:
+    residual, loo, leverage and weight are (T, ny), and ``walk`` has the T ny rows.
+
     Bands are valid under the random-walk model and its drift; they do not account for a wrong drift.
     """
 
     def __init__(self, path: Path, data: Data, run: Track, walk: Walk | None = None, order_by: Any = None) -> None:
         """``walk``: the problem, if it is not the one that `walk_of` collects from the run; its path has rho and c."""
-        self._walk = walk
+        self.run, self.order_by, self._walk, self._data = run, order_by, walk, data
         if walk is not None:
-            self._fit = Fit(walk.weight, path.rho, path.c)
-        self.run = run
-        self._path, self._data = path, data
-        self.order_by = order_by
-        self.theta = path.theta
-        self.rank = path.rank
+            self._fit = self._of_samples(walk.weight, path)
+        self._path = path = self._of_instants(path)
+        self.theta, self.rank, self.method = path.theta, path.rank, path.method
         self.cost, self.measurement_cost = path.cost, path.measurement_cost
-        self.method = path.method
         self.r = noise_variance(data, path) if data.r is None else data.r
 
     @classmethod
@@ -113,16 +114,19 @@ class Smoothed:
                 f"smooth: order_by= needs a drift along that variable, and {run.tracker!r} estimates one in time. "
                 "Use the tracker of tune(model, FLS(), y, u, order_by=..)."
             )
+        if order_by is not None and run.rows_per_instant > 1:
+            raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
         if getattr(run.tracker, "laws", None):
             return cls._by_laws(run, order_by, undetermined)
-        walk = walk_of(run, turned=True)
+        walk = walk_of(run.rows, turned=True)
         data, slopes = Data.of(walk), len(walk.trend) > 0
         weight = walk.weight.copy() if keep != "std" else NONE
-        path = solve(walk, keep, order_by, lambda: walk_of(run, turned=True))
+        path = solve(walk, keep, order_by, lambda: walk_of(run.rows, turned=True))
         del walk
         smoothed = cls(path, data, run, order_by=order_by)
         if keep != "std":
-            smoothed._fit = Fit(weight, path.rho, path.c)
+            smoothed._fit = smoothed._of_samples(weight, path)
+        path = smoothed._path
         unknown = np.isinf(path.var)
         smoothed.std = smoothed._std(path.var)
         smoothed._path = path._replace(var=NONE, rho=NONE, c=NONE)
@@ -133,10 +137,10 @@ class Smoothed:
         """Smooth a run whose parameters have laws (`driftfit.smooth.laws`)."""
         if order_by is not None:
             raise ValueError("smooth: order_by= needs random walks, and laws hold in time; leave it out.")
-        path, weight = laws.smooth(run)
+        path, weight = laws.smooth(run.rows)
         smoothed = cls(path, Data(int(np.count_nonzero(weight)), np.nan, run.tracker.r, True), run)  # type: ignore[attr-defined]
-        smoothed._fit = Fit(weight, path.rho, path.c)
-        return smoothed._determined(np.isinf(path.var), undetermined, int(path.rank[-1]))
+        smoothed._fit = smoothed._of_samples(weight, path)
+        return smoothed._determined(np.isinf(smoothed._path.var), undetermined, int(path.rank[-1]))
 
     def _determined(self, unknown: Array, undetermined: str, size: int) -> Smoothed:
         """This path, NaN or an error where the record does not determine parameters, ``unknown`` (T, n)."""
@@ -157,14 +161,24 @@ class Smoothed:
     @property
     def walk(self) -> Walk:
         """The problem that was solved; collected from the record again, as `smooth` did, if it was not given."""
-        return walk_of(self.run, turned=True) if self._walk is None else self._walk
+        return walk_of(self.run.rows, turned=True) if self._walk is None else self._walk
 
     @cached_property
     def _fit(self) -> Fit:
         """What residuals and leverages are made of; the problem is solved again unless it was kept."""
         walk = self.walk
-        path = solve(walk, "fit", self.order_by)
-        return Fit(walk.weight.copy(), path.rho, path.c)
+        return self._of_samples(walk.weight.copy(), solve(walk, "fit", self.order_by))
+
+    def _of_samples(self, weight: Array, path: Path) -> Fit:
+        """The same from a solution, with a column for each row of an instant if there are several."""
+        ny = self.run.rows_per_instant
+        return Fit(*(one.reshape(-1, ny) if ny > 1 else one for one in (weight, path.rho, path.c)))
+
+    def _of_instants(self, path: Path) -> Path:
+        """The path after the last row of each instant, between whose rows theta does not move."""
+        ny = self.run.rows_per_instant
+        last = {name: getattr(path, name)[ny - 1 :: ny] for name in PER_SAMPLE}
+        return path._replace(**last) if ny > 1 else path
 
     @property
     def weight(self) -> Array:
@@ -270,94 +284,11 @@ class Smoothed:
     @cached_property
     def _covariances(self) -> Path:
         """The path with its covariances; the problem is solved again unless they were kept."""
-        return self._path if len(self._path.cov) else solve(self.walk, "cov", self.order_by)
+        return self._path if len(self._path.cov) else self._of_instants(solve(self.walk, "cov", self.order_by))
 
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands, smoothed and filtered; a matplotlib figure. ``ax`` as for `Track.plot`."""
         return plot_smoothed(self.run, self.theta, *self.band(level), ax)
-
-
-class SmoothedShared(Smoothed):
-    """Shared parameters of a record, each estimated from the complete record.
-
-    As `Smoothed`, with ``theta``, ``std``, ``slope`` (T, n), ``rank`` (T,) and ``residual``, ``loo``, ``leverage``
-    (T, ny). ``rows`` is the path of the T ny rows. Rows of one instant are successive samples between which theta does
-    not move. The estimate after its last row is therefore that of the instant, and the lag from one instant to the next
-    is that from its last row to the first row of the next.
-    """
-
-    @classmethod
-    def of_shared(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Self:
-        """Smooth a record of outputs that share one theta."""
-        if order_by is not None:
-            raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
-        return cls(Smoothed.of(run.rows, keep, undetermined=undetermined), run)
-
-    def __init__(self, rows: Smoothed, run: Track) -> None:
-        self.rows, self._ny = rows, len(run.outputs)
-        self.run: Any = run
-        self._walk, self._path, self._data, self.order_by = rows._walk, rows._path, rows._data, None
-        self.theta, self.rank = self._last(rows.theta), self._last(rows.rank)
-        self.cost, self.method, self.r = rows.cost, rows.method, rows.r
-        self.measurement_cost = rows.measurement_cost
-
-    @property
-    def walk(self) -> Walk:
-        """The problem of the rows."""
-        return self.rows.walk
-
-    def _last(self, values: Array) -> Array:
-        """The values of each instant after all its rows."""
-        return values[self._ny - 1 :: self._ny]
-
-    def _by_output(self, values: Array) -> Array:
-        return values.reshape(-1, self._ny)
-
-    @cached_property
-    def std(self) -> Array:
-        return self._last(self.rows.std)
-
-    @property
-    def slope(self) -> Array:
-        """Change of theta per nominal interval, (T, n), if the slope is a random walk (``differences=2``)."""
-        return self._last(self.rows.slope)
-
-    @cached_property
-    def slope_std(self) -> Array:
-        """Standard deviation of the slope, (T, n)."""
-        return self._last(self.rows.slope_std)
-
-    @cached_property
-    def leverage(self) -> Array:
-        return self._by_output(self.rows.leverage)
-
-    @cached_property
-    def residual(self) -> Array:
-        return self._by_output(self.rows.residual)
-
-    @cached_property
-    def loo(self) -> Array:
-        return self._by_output(self.rows.loo)
-
-    @cached_property
-    def press(self) -> float:
-        return self.rows.press
-
-    @cached_property
-    def alone(self) -> int:
-        return self.rows.alone
-
-    @property
-    def weight(self) -> Array:
-        return self.rows.weight
-
-    def cov(self, t: int) -> Array:
-        """Covariance (n, n) of theta at sample t; entries of undetermined parameters are inf on the diagonal."""
-        return self.rows.cov(range(len(self.theta))[t] * self._ny + self._ny - 1)
-
-    def lag_cov(self, t: int) -> Array:
-        """Covariance (n, n) of theta at samples t and t + 1, rows for t."""
-        return self.rows.lag_cov(range(len(self.theta) - 1)[t] * self._ny + self._ny - 1)
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None, rebuild: Callable[[], Walk] | None = None) -> Path:

@@ -26,8 +26,8 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import DRIFT, Walk, constants
 from driftfit.smooth.problem import walk_of
+from driftfit.smooth.solvers.walk import DRIFT, Walk, constants
 
 SMOOTHING = 1e-6
 """eta, relative to the range of theta, but not below the rounding of theta; its size says nothing of its jumps."""

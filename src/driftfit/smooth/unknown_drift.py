@@ -11,12 +11,12 @@ found in three steps:
 
     1. tau, and one ratio of all parameters, of greatest evidence among `LEVELS`;
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
-       hundredth (`driftfit.smooth.parts.elimination`): climb by half powers of ten, for all parameters or one group,
+       hundredth (`driftfit.smooth.solvers.elimination`): climb by half powers of ten, for all parameters or one group,
        and average over the ratios that were tried, of which the smallest moves the path by less than its error;
     3. the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
-another model of the same record (`driftfit.smooth.parts.slopes`) and are averaged likewise; where they are more
+another model of the same record (`driftfit.smooth.solvers.slopes`) and are averaged likewise; where they are more
 probable than not, they are taken.
 
 Source: Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by their likelihood; the three steps are
@@ -34,11 +34,10 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Mixture, Passes, Problem
-from driftfit.smooth.parts import slopes
-from driftfit.smooth.parts.components import Noises
-from driftfit.smooth.parts.elimination import smooth_and_weigh
-from driftfit.smooth.parts.rank import column_scale
-from driftfit.smooth.parts.walk import Walk
+from driftfit.smooth.solvers import elimination, slopes
+from driftfit.smooth.solvers.components import Noises
+from driftfit.smooth.solvers.rank import column_scale
+from driftfit.smooth.solvers.walk import Walk
 
 Groups = Sequence[Sequence[int]]
 Point = tuple[int, ...]
@@ -53,7 +52,7 @@ SCALES = 3.0 ** np.arange(-1, 3)
 SHARE = 200.0
 FEW = 8
 """Components with which evidences are computed, and the path where they suffice."""
-LIKELY, LEAST = 0.1, 0.01
+LIKELY_SCALE, LIKELY_RATIO = 0.1, 0.01
 """Shares of the best below which scales, and ratios or slopes, are left out."""
 TRENDS = 3.0
 """Penalty of slopes that walk, in units of the log-likelihood."""
@@ -133,7 +132,7 @@ def with_slopes(walk: Walk, likely: Array, paths: Array, trend: Array, price: fl
     """The problem with slopes if they are more probable, and with the paths of all that are probable at all."""
     rates, better = slopes.compared(walk, trend, paths[np.argmax(likely), 0])
     p = shares(np.append(0.0, better - price))
-    which = np.flatnonzero(p[1:] >= LEAST)
+    which = np.flatnonzero(p[1:] >= LIKELY_RATIO)
     others = [slopes.smooth(sloped(walk, trend, rates[k])).theta for k in which]
     if p[0] < 0.5:
         walk = sloped(walk, trend, p[1:] @ rates / p[1:].sum())._replace(mixture=None)
@@ -161,10 +160,9 @@ def hypotheses(walk: Walk, time: Array, unit: Array, groups: Groups) -> Problem:
     label, zero = np.arange(len(roots)), np.zeros(len(roots), int)
     with np.errstate(divide="ignore"):
         log_prob = np.log([np.eye(1, len(roots))[0], [1.0 - PER_SAMPLE, *(PER_SAMPLE * p for _, p in jumps)]])
-    which = np.column_stack([zero, np.where(label > 0, label, -1)])
-    moves = Alternatives(zero, zero, label, log_prob, roots, which, np.tile([0, 1], (len(roots), 1)))
+    moves = Alternatives(zero, zero, label, log_prob, roots, adds=True)
     r = np.divide(1.0, walk.weight, out=np.full(T, np.inf), where=walk.weight > 0.0)
-    table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones(T)])
+    table, sizes = (time > 0.0).astype(int), np.column_stack([np.sqrt(time), np.ones((T, len(jumps)))])
     return Problem(
         walk.phi, walk.y.copy(), r, moves, table, sizes, np.zeros((0, n + 1)), Noises(np.eye(1, 2), np.zeros((1, 1)))
     )
@@ -191,10 +189,11 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     def value(at: Point) -> float:
         nonlocal paths
         if at not in known:
-            found = smooth_and_weigh(walk._replace(drift_root=np.sqrt(ratios[list(at)] * unit * time + jumps)), size)
-            known[at] = -np.inf if found is None else found[1]
+            root = np.sqrt(ratios[list(at)] * unit * time + jumps)
+            found = elimination.smooth(walk._replace(drift_root=root), size)
+            known[at] = -np.inf if found is None else found.log_likelihood
             if found is not None:
-                paths, least = {**paths, at: found[0].theta}, max(known.values()) + np.log(LEAST)
+                paths, least = {**paths, at: found.theta}, max(known.values()) + np.log(LIKELY_RATIO)
                 paths = {one: path for one, path in paths.items() if known[one] > least}
         return known[at]
 
@@ -210,7 +209,7 @@ def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
     """The average of the mixtures with all likely scales of the drift q (n,)."""
     scales = [Passes(drifting(problem, np.diag(np.sqrt(scale * q))), keep) for scale in SCALES]
     logs = np.array([one.forward() for one in scales])
-    order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY)]
+    order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY_SCALE)]
     found = [mixture.smooth(scales[order[0]], True)]
     enough = np.array_equal(found[0].kept, keep)
     found += [mixture.smooth(scales[k] if enough else scales[k].problem, True, found[0].kept) for k in order[1:]]

@@ -27,9 +27,9 @@ from driftfit.models.regression import Regression
 from driftfit.run.live.conformal import quantile
 from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
-from driftfit.smooth.parts.walk import ordered
 from driftfit.smooth.problem import walk_of
 from driftfit.smooth.smoothed import Smoothed
+from driftfit.smooth.solvers.walk import ordered
 from driftfit.trackers.base import Tracker
 from driftfit.tune.lanes import Task, score
 from driftfit.tune.parametrisation import Knobs, constant

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.bank.leaves.leaf_matrix import FIRST, spread
-from driftfit.engine.kernel import Array, exp, shared
+from driftfit.engine.kernel import Array, exp, part, shared
+from driftfit.engine.simd import WIDTH, fill, load, plus, store, times
 
 KEEP, RESET, KIND, GAIN = range(4)
 """Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an
@@ -185,17 +186,32 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
         renew(C, m, a, b, places[ANCHORS + c * n : ANCHORS + (c + 1) * n], places[MEAN], t.Q[c], t.spare_square)
 
 
+@part
+def predicted(n: int, t: Any, A: Array, K: int, c: int, C: Array, m: Array, to: int) -> None:
+    """C- = C / forget + Q and m of K leaves of A under change c, in the columns of C and m from ``to`` on. The rows of
+    g and one more are overwritten.
+    """
+    keep, reset, Q, mean = fill(t.maps[c, KEEP]), t.maps[c, RESET] > 0.0, t.Q[c], t.places[MEAN]
+    for l in range(0, K, WIDTH):
+        for k in range(n * (n + 1) // 2):
+            store(C, k, to + l, plus(times(keep, load(A, FIRST + n + k, l)), fill(Q[k])))
+        for i in range(n):
+            store(m, i, to + l, fill(mean[i]) if reset else load(A, FIRST + i, l))
+    if t.maps[c, KIND] > 0.0:
+        apply(t, C, m, to, to + K, c, t.from_g)
+
+
 @shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean m and covariance C of every leaf over all changes, without data: the first two moments
 
         m = sum_c p_c m_c,   C = sum_c p_c (C_c + (m_c - m) (m_c - m)'),
 
-    computed as differences from the leaf's own. Only the first ``Hd`` changes count, under ``Hm`` sensors. Needs tri +
-    2 n + 2 spare rows, unless all changes are walks.
+    computed as differences from the leaf's own. Only the first ``Hd`` changes count, under ``Hm`` sensors. Needs
+    tri + n + 1 spare rows, unless all changes are walks.
     """
     B, C, m, X, n, Q, maps, tri = t.leaves, t.C, t.m, t.spare, t.n, t.Q, t.maps, t.n * (t.n + 1) // 2
-    chance, work, one, mean = X[0], X[1 : 2 + n], X[2 + n : 2 + n + tri], X[2 + n + tri : 2 + 2 * n + tri]
+    chance, one, mean = X[0], X[1 : 1 + tri], X[1 + tri : 1 + tri + n]
     for k in range(n + tri):
         to = m[k] if k < n else C[k - n]
         for l in range(L):
@@ -210,13 +226,7 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
                 for l in range(L if Q[c, k] != 0.0 else 0):
                     C[k, l] += chance[l] * Q[c, k]
             continue
-        for k in range(tri):
-            for l in range(L):
-                one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
-        for i in range(n):
-            for l in range(L):
-                mean[i, l] = t.places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
-        apply(t, one, mean, 0, L, c, work)
+        predicted(n, t, B, L, c, one, mean, 0)
         for i in range(n):
             for l in range(L):
                 mean[i, l] -= B[FIRST + i, l]

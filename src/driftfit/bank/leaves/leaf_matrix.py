@@ -166,17 +166,18 @@ def standstill(prior: Array, a: int, b: int, Hm: int) -> None:
 def increments(t: Any, time: float, each: float) -> None:
     """Q[i] = lower triangle of the covariance that change i adds in this interval.
 
-    The first change takes ``time``, the others ``each``. Relative walks are in units of r / (mean square of phi_k).
+    The first change takes ``time``, the others ``each``. Relative walks are in units of r / (mean square of phi_k);
+    in the coordinates of the start, `walks` contain them.
     """
-    walks, relative, powers, Q = t.walks, t.relative_walks, t.powers, t.Q
+    walks, relative, c, Q = t.walks, t.relative_walks, t.c, t.Q
     unit = 1.0 if t.unknown > 0 else t.r
     for i in range(len(walks)):
         span = (time if i == 0 else each) * t.drift[i]
         for k in range(0, walks.shape[1], WIDTH):
             store(Q, i, k, times(load(walks, i, k), fill(span)))
-        for k in range(relative.shape[1]):
-            if relative[i, k] > 0.0 and powers[k] > 0.0:
-                Q[i, k * (k + 1) // 2 + k] += relative[i, k] * (unit / powers[k]) * span
+        for k in range(relative.shape[1] if t.framed == 0 else 0):
+            if relative[i, k] > 0.0 and c[k] > 0.0:
+                Q[i, k * (k + 1) // 2 + k] += relative[i, k] * (unit / c[k]) * span
 
 
 @kernel

@@ -5,9 +5,9 @@ noise variance a that the function returns,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so C remains a covariance whatever the function returns; a = inf is `LARGEST` times h + r. The function is compiled by
-itself, in a second or two, and the compiled routine of a bank calls it by its address (`call`), which a step has looked
-up by its symbol; the routine is not recompiled.
+so C remains a covariance whatever the function returns; a = inf is `LARGEST_NOISE` times h + r. The function is
+compiled by itself, in a second or two. The compiled routine of a bank calls it by its address (`call`), which a step
+has looked up by its symbol; the routine is not recompiled.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
 
 OWN_AT = ROW["own_likelihoods"]
-LARGEST, LEAST = 1e12, 1e-12
+LARGEST_NOISE, LEAST_NOISE = 1e12, 1e-12
 """Limits of noise variances: at most this multiple of the forecast's variance, which has no effect, and at least this
 share of the nominal one.
 """
@@ -74,43 +74,34 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, answers: Ar
     h = expected[0, l]
     readings = y + t.shift, expected[1, l] + t.shift
     call(t.own_likelihoods, (which, *readings, h * unit, r * unit, t.reading), answers.ctypes.data)
-    most = LARGEST * (h + r)
-    answers[NOISE] = max(answers[NOISE] / unit, LEAST * r) if answers[NOISE] < most * unit else most
+    most = LARGEST_NOISE * (h + r)
+    answers[NOISE] = max(answers[NOISE] / unit, LEAST_NOISE * r) if answers[NOISE] < most * unit else most
     answers[LOG_P] = answers[LOG_P] if answers[LOG_P] < np.inf else -np.inf
     answers[CLEAN] = answers[CLEAN] if abs(answers[CLEAN]) < np.inf else y
 
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """Evaluate the function for every leaf: log densities in the first row of `scores`, h + a in the place of h; h and
-    what the function returns as the output in the two rows of `answers`.
+    """Evaluate the function for every leaf: log densities in the first row of `scores`, noise variances in its last
+    row, and what the function returns as the output in the first row of `answers`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, because numbers are divided by
     it.
     """
-    h, kept, answer = t.expected[0], t.answers, t.answers[2]
+    clean, answer = t.answers[0], t.answers[1]
     for l in range(-(-columns // WIDTH) * WIDTH):
-        kept[0, l], answer[NOISE] = h[l], r
+        answer[NOISE] = r
         if l < columns:
             judge(t, which, at, l, y, r, answer)
-            t.scores[0, l], kept[1, l] = answer[LOG_P], answer[CLEAN]
-        h[l] += answer[NOISE]
+            t.scores[0, l], clean[l] = answer[LOG_P], answer[CLEAN]
+        t.scores[2, l] = answer[NOISE]
 
 
 @shared
-def restore(t: Any, at: int, columns: int, cleans: bool) -> None:
-    """Restore h; with ``cleans``, the output that the function returns is the newest lag."""
-    lags = lag_row(t)
-    for l in range(-(-columns // WIDTH) * WIDTH):
-        t.expected[0, l] = t.answers[0, l]
-    for l in range(columns if cleans else 0):
-        t.leaves[lags, at + l] = t.answers[1, l]
-
-
-@kernel
-def no_own_sensor(s: State, l: int) -> None:
-    """Most banks have no functions of the user's."""
-    s.table[OWN_AT, 0, l] = 0
+def clean_lags(t: Any, at: int, columns: int) -> None:
+    """The output that the function returned is the newest lag."""
+    for l in range(columns):
+        t.leaves[lag_row(t), at + l] = t.answers[0, l]
 
 
 @cache

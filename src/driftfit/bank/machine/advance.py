@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.layout import FORECAST, NEVER, READY, SAMPLE_HEAD, table_at
+from driftfit.bank.layout import ENTER, FORECAST, NEVER, READY, SAMPLE_HEAD, table_at
 from driftfit.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.bank.leaves.forget import BEFORE, GROWTH, PER_CAP, for_interval, foresee
 from driftfit.bank.leaves.lags import push, shift_covariance, widen_by_lags
@@ -34,6 +34,7 @@ from driftfit.bank.leaves.leaf_matrix import (
     variance_factor,
 )
 from driftfit.bank.machine.ancestry import chained, descend, marginals, shift
+from driftfit.bank.machine.framed import enter, write_changes
 from driftfit.bank.machine.gap import SINCE, chances, close, covariances, extend, odds, widen
 from driftfit.bank.machine.grow import grow
 from driftfit.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
@@ -384,11 +385,16 @@ def limit_forgetting(t: Any) -> None:
 
 @partial(machine, short=True)  # rows of a dozen leaves: copies of loops for long rows made it a tenth slower
 def bank(address: int) -> None:
-    """The forecast of a sample, or its processing, by ``PHASE``, given the table of a bank."""
+    """The forecast of a sample, or its processing, by its phase, given the table of a bank."""
     t = table_at(address)
     head = t.report
     begun = t.settled == 1
+    if t.phase >= ENTER:
+        enter(t, t.phase == ENTER)
+        return
     if t.phase == FORECAST:
+        if t.framed > 0:
+            write_changes(t)
         t.last = t.reading - t.shift
         if begun:
             look(t)

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from driftfit.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
-from driftfit.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
+from driftfit.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply, predicted
 from driftfit.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.bank.leaves.own_sensor import judge_all, restore
+from driftfit.bank.leaves.own_sensor import clean_lags, judge_all
 from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.forms.covariance import LEFT
@@ -55,16 +55,8 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
     """
     if own:
         return int(develop_own(t, K))
-    A, C, m, Q, maps, places, first = t.parents, t.C, t.m, t.Q, t.maps, t.places, FIRST + n
     for c in range(len(t.walks)):
-        keep, reset = fill(maps[c, KEEP]), maps[c, RESET] > 0.0
-        for l in range(0, K, WIDTH):
-            for k in range(n * (n + 1) // 2):
-                store(C, k, c * K + l, plus(times(keep, load(A, first + k, l)), fill(Q[c, k])))
-            for i in range(n):
-                store(m, i, c * K + l, fill(places[MEAN, i]) if reset else load(A, FIRST + i, l))
-        if maps[c, KIND] > 0.0:
-            apply(t, C, m, c * K, (c + 1) * K, c, t.from_g)
+        predicted(n, t, t.parents, K, c, t.C, t.m, c * K)
     return K * len(t.walks)
 
 
@@ -78,15 +70,15 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
 
 
 @part(sizes=(2, 3, 4))
-def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
-    """Measurement update of the leaves from column ``at`` on; the last two rows of `scores` receive
-    eps^2 / s and s.
+def correct(n: int, t: Any, at: int, columns: int, y: float) -> None:
+    """Measurement update of the leaves from column ``at`` on; the last two rows of `scores`, whose last one holds the
+    noise variances r_j, receive eps^2 / s and s.
 
     A variance keeps at least the share `LEFT` of its value, so that rounding cannot make it negative.
     """
     B, C, m, g, expected, scores = t.leaves, t.C, t.m, t.g, t.expected, t.scores
     for l in range(0, columns, WIDTH):
-        s = plus(load(expected, 0, l), fill(noise))  # s = r_j + z'C- z
+        s = plus(load(expected, 0, l), load(scores, 2, l))  # s = r_j + z'C- z
         eps, gain, entry = minus(fill(y), load(expected, 1, l)), over(fill(1.0), s), 0
         store(scores, 1, l, times(eps, times(gain, eps)))
         store(scores, 2, l, s)
@@ -235,10 +227,11 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             frozen(t, at, columns, y, last, sensors[j, STUCK])
         elif sensors[j, OWN] > 0.0:
             judge_all(t, sensors[j, OWN], at, columns, y, t.r * noise)
-            correct(t.n, t, at, columns, y, 0.0)
-            restore(t, at, columns, False)
+            correct(t.n, t, at, columns, y)
         else:
-            correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.r * noise)
+            for l in range(0, columns, WIDTH):
+                store(t.scores, 2, l, fill(sensors[j, FACTOR] * t.r * noise))
+            correct(t.n, t, at, columns, y - sensors[j, VALUE])
             if t.unknown > 0:
                 student(t, at, columns)
             else:
@@ -249,7 +242,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             push(t, t.parents, K, at, columns, y - sensors[j, VALUE], own_lags)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
         if sensors[j, OWN] > 0.0 and sensors[j, CLEANS] > 0.0 and t.output_lags > 0:
-            restore(t, at, columns, True)
+            clean_lags(t, at, columns)
         # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.layout import (
-    BASES as BASE_NAMES,
-)  # fmt: skip
+from driftfit.bank.layout import BASES as BASE_NAMES
 from driftfit.bank.layout import (
     COUNTER,
+    ENTER,
+    ENTER_NEW,
     FORECAST,
     LEARN,
     MEMORY_AT,
+    OUTPUT_LAGS,
     READY,
     REPORT_AT,
     ROW,
@@ -26,33 +27,33 @@ from driftfit.bank.layout import (
     report_at,
 )
 from driftfit.bank.leaves.lags import PLAUSIBLE
-from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of, no_own_sensor
+from driftfit.bank.leaves.own_sensor import OWN_AT, entry_of
 from driftfit.bank.machine.advance import bank
-from driftfit.bank.machine.framed import (
-    AT,
-    FRAMED,
-    begin_framed,
-    call_framed,
-    enter_bank,
-    frame_theta,
-    outgrown,
-    read_framed,
-    spans_lags,
-)
+from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, read_framed, spans_lags
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
-from driftfit.trackers.forms.coordinates import FRAME, whiten_within
-from driftfit.trackers.forms.covariance import correct as correct_one
-from driftfit.trackers.forms.covariance import forecast as forecast_one
+from driftfit.trackers.forms.coordinates import FRAME, new_row, whiten_within
 from driftfit.trackers.forms.covariance import prediction
-from driftfit.trackers.forms.diffuse import correct_on_roots, forecast_on_roots, spanned_variance, wander
+from driftfit.trackers.forms.diffuse import (
+    ENTERING,
+    NOISE,
+    NOW,
+    OK,
+    WORK,
+    Y,
+    absorb_on_roots,
+    forecast_on_roots,
+    spanned_variance,
+    wander,
+)
+from driftfit.trackers.forms.diffuse import hand_over as choose_form
 from driftfit.trackers.forms.excitation import learn_scales
 from driftfit.trackers.forms.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.student import RESIDUALS, wider
 
 BASES = len(BASE_NAMES)
-GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
+GIVEN, GIVEN_CHAIN, DRIFT, LAG_ROWS = (ROW[name] for name in ("given", "given_chain", "drift", "lag_rows"))
 
 
 @kernel
@@ -67,20 +68,6 @@ def keep(o: State, s: State, l: int) -> None:
 @kernel
 def only_drift(s: State, l: int) -> None:
     """The time update by the first change, for the single filter before the bank starts."""
-    time = s.dt[l] * s.drift[l]
-    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
-    at = 0
-    for i in range(s.theta.shape[0]):
-        for j in range(i + 1):
-            s.P[i, j, l] = s.P[i, j, l] * keep + s.q0[at, l] * time
-            at += 1
-        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        s.P[i, i, l] += s.size0[i, l] * unit * time
-
-
-@kernel
-def only_drifted(s: State, l: int) -> None:
-    """The same in square-root form."""
     n = s.theta.shape[0]
     time = s.dt[l] * s.drift[l]
     root = exp(-0.5 * s.dt[l] * log(s.keep0[l]))
@@ -114,17 +101,18 @@ def run(s: State, l: int) -> None:
     """Call the compiled routine, whose table receives the addresses of the fields for that time. The numbers of one of
     several lanes are not contiguous, so the routine works on copies behind the memory.
     """
-    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
+    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.counters[COUNTER.framed, l] > 0
     sizes = (
-        s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, s.counters.shape[0], s.sample.shape[0],
-        3 * ROWS,
+        s.table[MEMORY_AT, 2, l], s.table[REPORT_AT, 2, l], n, n, n, n * n, n * n, n * n, n * n, n * n, WORK * n, NOW,
+        s.counters.shape[0], s.sample.shape[0], 3 * ROWS,
     )  # fmt: skip
     fields = (
         memory_at(s), report_at(s), np.int64(s.x.ctypes.data if framed else s.phi.ctypes.data),
-        np.int64(s.no_power.ctypes.data if framed else s.c.ctypes.data),
-        np.int64(s.d.ctypes.data if framed else s.theta.ctypes.data),
-        np.int64(s.Pz.ctypes.data if framed else s.P.ctypes.data),
-        np.int64(s.counters.ctypes.data), np.int64(s.sample.ctypes.data), np.int64(s.table.ctypes.data),
+        np.int64(s.c.ctypes.data), np.int64(s.d.ctypes.data if framed else s.theta.ctypes.data),
+        np.int64(s.Pz.ctypes.data if framed else s.P.ctypes.data), np.int64(s.S.ctypes.data),
+        np.int64(s.R.ctypes.data), np.int64(s.H.ctypes.data), np.int64(s.W.ctypes.data), np.int64(s.work.ctypes.data),
+        np.int64(s.at_start.ctypes.data), np.int64(s.counters.ctypes.data), np.int64(s.sample.ctypes.data),
+        np.int64(s.table.ctypes.data),
     )  # fmt: skip
     copies = fields[0] + 8 * sizes[0] * L
     to = copies
@@ -153,8 +141,8 @@ def repeated(s: State, l: int) -> float:
 def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine, and the output lags of the record."""
     n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
-    for k in range(s.table[AT.output_lags, 0, l]):
-        memory[s.table[AT.lag_rows, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
+    for k in range(s.table[OUTPUT_LAGS, 0, l]):
+        memory[s.table[LAG_ROWS, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
     s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = (
         s.y[l],
         s.noise[l] * repeated(s, l),
@@ -167,12 +155,12 @@ def hand_over(s: State, l: int) -> None:
 
 
 @kernel
-def alone(s: State, l: int, counts: bool) -> None:
+def alone(s: State, l: int) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     residuals = s.count[l]
     s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
-    if counts:
+    if s.unknown[l] > 0 and s.s[l] < np.inf:
         learn_resolved_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
@@ -180,6 +168,8 @@ def alone(s: State, l: int, counts: bool) -> None:
     s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
     s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready:
+        choose_form(s, l)
     if ready and s.root[l] > 0:
         ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
         if ready:
@@ -194,15 +184,13 @@ def alone(s: State, l: int, counts: bool) -> None:
 def forecast_tree(s: State, l: int) -> None:
     """The forecast of the tree, in theta or in coordinates of the start."""
     column, y_hat, outside = -1, 0.0, False
-    if s.framed[l] > 0:
+    if s.counters[COUNTER.framed, l] > 0:
         column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
         outside = column >= 0
     if not outside and s.ok[l] > 0.0 and s.can_frame[l] > 0:
         column = outgrown(s, l)
-        if column >= 0 and s.framed[l] == 0:
+        if column >= 0 and s.counters[COUNTER.framed, l] == 0:
             frame_theta(s, l)
-    if s.framed[l] > 0:
-        call_framed(s, -1, 1.0 if s.unknown[l] > 0 else s.r[l], l)
     hand_over(s, l)
     s.column[l] = column
     if column >= 0:
@@ -217,78 +205,33 @@ def forecast_tree(s: State, l: int) -> None:
 
 
 @kernel
+def enter(s: State, column: int, l: int) -> None:
+    """Row ``column`` of M becomes the rest of this regressor. The tree has made the time update."""
+    fresh = s.S[column, column, l] == 0.0
+    sign = new_row(s, s.phi, column, l)
+    noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
+    s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
+    s.counters[COUNTER.phase, l] = ENTER_NEW if fresh else ENTER
+    run(s, l)
+    s.counters[COUNTER.phase, l] = LEARN
+    for i in range(column, s.theta.shape[0]):
+        s.x[i, l] = 0.0
+
+
+@kernel
 def correct_tree(s: State, l: int) -> None:
     """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
     column, outside = s.column[l], s.s[l] == np.inf
     s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
     run(s, l)
     if column >= 0 and s.ok[l] > 0.0:
-        enter_bank(s, column, l)
+        enter(s, column, l)
         if not outside:
             e, v = s.y[l] - s.y_hat[l], s.s[l]
             floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
                 log(2.0 * np.pi * v) + e * e / v
             )
     learn_scales(s, l)
-
-
-@kernel
-def forecast(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.counters[COUNTER.settled, l] > 0:
-        forecast_tree(s, l)
-    else:
-        only_drift(s, l)
-        forecast_one(s, l)
-        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l])
-
-
-@kernel
-def correct(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        correct_tree(s, l)
-    else:
-        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-        correct_one(s, l)
-        alone(s, l, s.unknown[l] > 0)
-
-
-@kernel
-def read(s: State, l: int) -> None:
-    """theta and its variance from the mixture."""
-    if s.framed[l] > 0:
-        read_framed(s, l)
-    else:
-        diagonal(s, l)
-
-
-@kernel
-def forecast_first(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.counters[COUNTER.settled, l] > 0:
-        forecast_tree(s, l)
-    else:
-        only_drifted(s, l)
-        forecast_on_roots(s, l)
-        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
-
-
-@kernel
-def correct_first(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        correct_tree(s, l)
-    else:
-        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-        correct_on_roots(s, l)
-        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-
-
-@kernel
-def read_first(s: State, l: int) -> None:
-    if s.counters[COUNTER.settled, l] > 0:
-        read(s, l)
-    else:
-        spanned_variance(s, l)
 
 
 @kernel
@@ -303,10 +246,41 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
+@kernel
+def forecast(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.counters[COUNTER.settled, l] > 0:
+        forecast_tree(s, l)
+    else:
+        only_drift(s, l)
+        forecast_on_roots(s, l)
+        s.s[l] = s.scale[l] * (s.h[l] + s.r[l] * s.noise[l]) if s.h[l] < np.inf else np.inf
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    if s.counters[COUNTER.settled, l] > 0:
+        correct_tree(s, l)
+    else:
+        s.s[l] = s.h[l] + s.r[l] * s.noise[l]
+        absorb_on_roots(s, l)
+        alone(s, l)
+
+
+@kernel
+def read(s: State, l: int) -> None:
+    """theta and its variance from the mixture."""
+    if s.counters[COUNTER.settled, l] <= 0:
+        spanned_variance(s, l)
+    elif s.counters[COUNTER.framed, l] > 0:
+        read_framed(s, l)
+    else:
+        diagonal(s, l)
+
+
 STEPS = TrackerSteps(
-    no_own_sensor, forecast, correct, read, nothing,
-    start=TrackerSteps(no_own_sensor, forecast_first, correct_first, read_first, nothing),
-    store=keep, read_extra=take_known, machines=(*FRAME, *FRAMED, bank), outlined=True,
+    nothing, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
+    outlined=True,
 )  # fmt: skip
 
 
@@ -316,6 +290,4 @@ def steps_of(own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
     if not own:
         return STEPS
     entry, point_out = entry_of(own)
-    assert STEPS.start is not None
-    start = STEPS.start._replace(predict=point_out)
-    return STEPS._replace(predict=point_out, start=start, machines=(*STEPS.machines, entry))
+    return STEPS._replace(predict=point_out, machines=(*STEPS.machines, entry))

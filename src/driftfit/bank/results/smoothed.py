@@ -36,8 +36,8 @@ from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Problem
-from driftfit.smooth.parts.components import Noises
 from driftfit.smooth.problem import replay
+from driftfit.smooth.solvers.components import Noises
 from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
 from driftfit.trackers.forms.information import triangular_root
 
@@ -147,12 +147,11 @@ def problem_of(run: Track, faults: list[Event], kinds: Array | None = None) -> P
         axes, rows = np.linalg.eigh(matrix("Bank", "p0", bank.p0, n) * relative)
         rows = rows.T / np.sqrt(np.maximum(axes, KNOWN * axes.max()))[:, None]
         start = np.column_stack([rows, rows @ np.broadcast_to(bank.theta0, n)])
-    priors = Priors(bank, run, replayed["dt"][:, 0])
-    chosen = priors.events() if kinds is None else priors.known(kinds)
+    priors = Priors(bank, run, replayed["dt"][:, 0], kinds)
     roots = np.array([triangular_root(Q) for Q in moves])
     sound = ok & ~faulty(run, faults, only_away=True)
     return Problem(
-        phi, replayed["y"][:, 0].copy(), np.where(sound, noise * weighs, np.inf), chosen._replace(roots=roots),
+        phi, replayed["y"][:, 0].copy(), np.where(sound, noise * weighs, np.inf), Alternatives(*priors.moves(), roots),
         priors.table, priors.sizes(), start, priors.noises(),
     )  # fmt: skip
 
@@ -164,7 +163,7 @@ KNOWN = 1e-16
 class Priors:
     """The prior probabilities of a run as moves between modes."""
 
-    def __init__(self, bank: Bank, run: Track, dt: Array) -> None:
+    def __init__(self, bank: Bank, run: Track, dt: Array, kinds: Array | None) -> None:
         T, self.bank, self.dt = len(run), bank, dt
         self.Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
         H = self.Hd * Hm
@@ -181,7 +180,9 @@ class Priors:
         if len(given) > 1:
             keys += [*np.nan_to_num(given, nan=-1.0).T]
         self.rows, table = np.unique(np.column_stack(keys), axis=0, return_inverse=True)
-        self.table = np.asarray(table).reshape(-1)
+        self.table, self.known = np.asarray(table).reshape(-1), kinds is not None
+        if kinds is not None:
+            self.table, self.chained = kinds, False
 
     def _without(self, p: Array) -> Array:
         """Probabilities (.., H_d, H_m) of the sensors that are noises, as shares."""
@@ -202,27 +203,21 @@ class Priors:
             P = np.kron(given[H:].reshape(self.Hd, self.Hd), sensors)
         return np.asarray(np.linalg.matrix_power(P, round(dt)) if self.chained else P)
 
-    def events(self) -> Alternatives:
-        """The moves, without roots."""
-        chains = np.array([self._row(row) for row in self.rows])
+    def moves(self) -> tuple[Array, Array, Array, Array]:
+        """Modes before and after, events, and tables of log probabilities of the moves."""
         count, size = len(self.noise_of), len(self.P)
+        zero, chains = np.zeros(self.Hd, int), np.array([self._row(row) for row in self.rows])
         with np.errstate(divide="ignore"):
             if self.chained:
                 source, target = (one.ravel() for one in np.indices((size, size)))
-                return made(source, target, target // count, np.log(chains.reshape(len(chains), -1)))
+                return source, target, target // count, np.log(chains.reshape(len(chains), -1))
+            if self.known:
+                return zero, zero, np.arange(self.Hd), np.log(np.eye(self.Hd))
             p = chains[:, 0].reshape(-1, self.Hd, count).sum(axis=2)
             as_given = (self.rows[:, 0] > 0.0) | (self.rows[:, 2:3] >= 0.0).any(axis=1)
             quiet = np.where(as_given, p[:, 0], p[:, 0] ** self.rows[:, 1])
             others = p[:, 1:] * ((1.0 - quiet) / np.where(p[:, 0] < 1.0, 1.0 - p[:, 0], 1.0))[:, None]
-            zero = np.zeros(self.Hd, int)
-            return made(zero, zero, np.arange(self.Hd), np.log(np.column_stack([quiet, others])))
-
-    def known(self, kinds: Array) -> Alternatives:
-        """The moves if the changes are known."""
-        self.table, self.chained = kinds, False
-        zero = np.zeros(self.Hd, int)
-        with np.errstate(divide="ignore"):
-            return made(zero, zero, np.arange(self.Hd), np.log(np.eye(self.Hd)))
+            return zero, zero, np.arange(self.Hd), np.log(np.column_stack([quiet, others]))
 
     def sizes(self) -> Array:
         """(T, H_d): factors of the roots of the changes; an event happens once, whatever the interval."""
@@ -243,12 +238,6 @@ class Priors:
             p = np.tile(np.eye(len(kept)), (self.Hd, 1))
         with np.errstate(divide="ignore"):
             return Noises(noises, np.log(p))
-
-
-def made(source: Array, target: Array, label: Array, logs: Array) -> Alternatives:
-    """Moves whose increments are those of their event."""
-    which = np.column_stack([label, np.full(len(label), -1)])
-    return Alternatives(source, target, label, logs, np.zeros((0, 0, 0)), which, np.column_stack([label, label]))
 
 
 def scaled(problem: Problem, c: float) -> Problem:

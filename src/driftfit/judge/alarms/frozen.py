@@ -46,7 +46,7 @@ from driftfit.run.live.reference_model import (
     V,
     Y,
 )
-from driftfit.smooth.parts.rank import column_sizes
+from driftfit.smooth.solvers.rank import column_sizes
 
 CLIPS = (2.5, 3.0, 3.5, 4.0)
 """Scores are residuals clipped at one of these numbers of scales."""

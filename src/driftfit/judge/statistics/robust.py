@@ -16,7 +16,7 @@ import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, shared
-from driftfit.smooth.parts.rank import column_sizes
+from driftfit.smooth.solvers.rank import column_sizes
 
 CLIP = 1.5
 ROUNDS = 30

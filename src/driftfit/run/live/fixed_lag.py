@@ -16,8 +16,8 @@ import numpy as np
 from driftfit.data.storage import fields
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.smooth.parts import slopes, two_filters
-from driftfit.smooth.parts.walk import Walk, room_for_signals
+from driftfit.smooth.solvers import slopes, two_filters
+from driftfit.smooth.solvers.walk import Walk, room_for_signals
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.information import triangular_root
 

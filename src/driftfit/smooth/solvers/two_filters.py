@@ -23,14 +23,14 @@ Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the ro
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.tiles import WIDTH, make_tile
-from driftfit.smooth.parts.walk import Path, Walk
-from driftfit.trackers.forms import information
+from driftfit.smooth.solvers.walk import Path, Walk
+from driftfit.trackers.forms.information import absorb, invert, shear, solve, spread
 
 KNOWN_EXACTLY = 1e8
 """Information on directions that the prior fixes, relative to that of all samples; its square exceeds the precision."""
@@ -45,6 +45,13 @@ class Start(NamedTuple):
     values: Array
     hidden: Array
     """(n,) or (T, n) bool"""
+
+    @classmethod
+    def fixing(cls, natural: Array, scale: Array, scaled: Array, hidden: Array) -> Self:
+        """The start that fixes these directions of theta, in rows, at the first point, ``scaled`` as its columns."""
+        rows = natural / scale
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        return cls(rows, rows[:, : len(scaled)] @ scaled, hidden)
 
 
 def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") -> Path:
@@ -75,7 +82,7 @@ def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std")
     cost = filter_both(pair, walk, rows, values, blocks)
     theta, var, rho, c = np.empty((T, n)), np.empty((T, n)), np.empty(T), np.empty(T)
     R = np.empty((T if keep == "cov" else 0, n, n))
-    _meet()(workspace(n, WIDTH).copy(), _weighted(walk), blocks, theta, var, rho, c, R)
+    meet(workspace(n, WIDTH).copy(), _weighted(walk), blocks, theta, var, rho, c, R)
     cov = R @ R.swapaxes(1, 2)
     return Path(theta, var, rho, c, cost, np.nan, np.nan, cov, cov, "safe"), blocks
 
@@ -87,7 +94,7 @@ def filter_both(pair: Array, walk: Walk, rows: Array, values: Array, blocks: Arr
     """
     drift = np.sqrt(np.append(walk.drift, 0.0))
     start = np.column_stack([rows, values])
-    return float(_filters()(pair, _weighted(walk), drift, *_changes(walk), start, blocks))
+    return float(filters(pair, _weighted(walk), drift, *_changes(walk), start, blocks))
 
 
 def _weighted(walk: Walk) -> Array:
@@ -115,12 +122,8 @@ def start(walk: Walk, scale: Array, unseen: Array) -> Start:
         sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
         rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
         return Start(rows, rows @ theta0, np.zeros(len(scale), bool))
-    if unseen.shape[1] == 0:
-        return Start(np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool))
     natural = unspanned(unseen, scale)
-    rows = natural / scale
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return Start(rows, rows @ theta0, undetermined(natural))
+    return Start.fixing(natural, scale, theta0, undetermined(natural))
 
 
 def unspanned(unseen: Array, scale: Array) -> Array:
@@ -185,117 +188,104 @@ def workspace(n: int, L: int) -> Array:
     return make_tile(n, 0, {}, [{"theta": vector, "rho": 0.0, "c": 0.0, **names}] * L)
 
 
-@lru_cache
-def _filters() -> Driver:
-    """The loop of both filters; it is a closure, so that the cache on disk detects changes of a kernel."""
-    absorb, spread, shear, width = information.absorb, information.spread, information.shear, WIDTH
+@Driver
+def filters(
+    work: Array, samples: Array, drift: Array, drift_root: Array, trend: Array, rows: Array, blocks: Array
+) -> float:
+    """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0.
 
-    @Driver
-    def filters(
-        work: Array, samples: Array, drift: Array, drift_root: Array, trend: Array, rows: Array, blocks: Array
-    ) -> float:
-        """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0.
-
-        ``samples`` (T, n + 1) are sqrt(w) phi and sqrt(w) y, ``rows`` (k, n + 1) the start: rows of theta and values.
-        """
-        s = work[0]
-        T, n = samples.shape[0], s.d.shape[0]
-        # information before the first sample, for the forward filter only
-        s.H[:] = s.G
-        for k in range(rows.shape[0]):
-            for i in range(n):
-                s.row[i, 0] = rows[k, i]
-            absorb(s.S, s.d, s.row, rows[k, n], 0)
-        cost = 0.0
-        for t in range(T):
-            # time update: the increment before the sample in this filter's direction of time
-            if drift_root.shape[0] > 0:
-                for l in range(2):
-                    for i in range(n):
-                        for j in range(i, n):
-                            s.H[i, j, l] = drift_root[t if l == 0 else T - t, i] * s.G[i, j, l]
-            if trend.shape[0] > 0:
-                shear(s.S, -trend[t], 0)
+    ``samples`` (T, n + 1) are sqrt(w) phi and sqrt(w) y, ``rows`` (k, n + 1) the start: rows of theta and values.
+    """
+    s = work[0]
+    T, n = samples.shape[0], s.d.shape[0]
+    # information before the first sample, for the forward filter only
+    s.H[:] = s.G
+    for k in range(rows.shape[0]):
+        for i in range(n):
+            s.row[i, 0] = rows[k, i]
+        absorb(s.S, s.d, s.row, rows[k, n], 0)
+    cost = 0.0
+    for t in range(T):
+        # time update: the increment before the sample in this filter's direction of time
+        if drift_root.shape[0] > 0:
             for l in range(2):
-                spread(s.S, s.d, s.H, drift[t if l == 0 else T - t], s.pivot, l)
-            if trend.shape[0] > 0:
-                shear(s.S, trend[T - t], 1)
-            # store the information without the sample, then rotate the sample in
-            for l in range(2):
-                at = t if l == 0 else T - 1 - t
-                block, lane = blocks[at // width], at % width
-                k = 0
                 for i in range(n):
-                    block.d[l, i, lane] = s.d[i, l]
                     for j in range(i, n):
-                        block.S[l, k, lane] = s.S[i, j, l]
-                        k += 1
-                for i in range(n):
-                    s.row[i, l] = samples[at, i]
-                s.y[l] = samples[at, n]
-            for l in range(2):
-                s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
-            cost += s.rho[0] * s.rho[0]
-        return cost
-
-    return filters
-
-
-@lru_cache
-def _meet() -> Driver:
-    """The loop that combines the two filters, `WIDTH` samples at a time."""
-    absorb, solve, invert, width = information.absorb, information.solve, information.invert, WIDTH
-
-    @Driver
-    def meet(
-        work: Array, samples: Array, blocks: Array, theta: Array, var: Array, rho: Array, c: Array, inverse: Array
-    ) -> None:
-        s = work[0]
-        T, n = samples.shape[0], s.d.shape[0]
-        for b in range(blocks.shape[0]):
-            block, first = blocks[b], b * width
-            count = min(width, T - first)
-            # information from the samples before: (S-, d-)
+                        s.H[i, j, l] = drift_root[t if l == 0 else T - t, i] * s.G[i, j, l]
+        if trend.shape[0] > 0:
+            shear(s.S, -trend[t], 0)
+        for l in range(2):
+            spread(s.S, s.d, s.H, drift[t if l == 0 else T - t], s.pivot, l)
+        if trend.shape[0] > 0:
+            shear(s.S, trend[T - t], 1)
+        # store the information without the sample, then rotate the sample in
+        for l in range(2):
+            at = t if l == 0 else T - 1 - t
+            block, lane = blocks[at // WIDTH], at % WIDTH
             k = 0
             for i in range(n):
-                for l in range(width):
-                    s.d[i, l] = block.d[0, i, l]
-                    for j in range(i, n):
-                        s.S[i, j, l] = block.S[0, k + j - i, l]
-                k += n - i
-            # rotate in the rows of (S+, d+), the information from the samples after
-            k = 0
+                block.d[l, i, lane] = s.d[i, l]
+                for j in range(i, n):
+                    block.S[l, k, lane] = s.S[i, j, l]
+                    k += 1
             for i in range(n):
-                for l in range(width):
+                s.row[i, l] = samples[at, i]
+            s.y[l] = samples[at, n]
+        for l in range(2):
+            s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
+        cost += s.rho[0] * s.rho[0]
+    return cost
+
+
+@Driver
+def meet(
+    work: Array, samples: Array, blocks: Array, theta: Array, var: Array, rho: Array, c: Array, inverse: Array
+) -> None:
+    """Combine the two filters, `WIDTH` samples at a time."""
+    s = work[0]
+    T, n = samples.shape[0], s.d.shape[0]
+    for b in range(blocks.shape[0]):
+        block, first = blocks[b], b * WIDTH
+        count = min(WIDTH, T - first)
+        # information from the samples before: (S-, d-)
+        k = 0
+        for i in range(n):
+            for l in range(WIDTH):
+                s.d[i, l] = block.d[0, i, l]
+                for j in range(i, n):
+                    s.S[i, j, l] = block.S[0, k + j - i, l]
+            k += n - i
+        # rotate in the rows of (S+, d+), the information from the samples after
+        k = 0
+        for i in range(n):
+            for l in range(WIDTH):
+                for j in range(n):
+                    s.row[j, l] = block.S[1, k + j - i, l] if j >= i else 0.0
+                absorb(s.S, s.d, s.row, block.d[1, i, l], l)
+            k += n - i
+        # rotate in the sample itself: rho and the cosine c give residual and leverage
+        for l in range(count):
+            for i in range(n):
+                s.row[i, l] = samples[first + l, i]
+            s.y[l] = samples[first + l, n]
+        for l in range(WIDTH):
+            s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
+        # theta = S^-1 d, and its variances from R = S^-1
+        for l in range(WIDTH):
+            solve(s.S, s.d, s.x, l)
+            invert(s.S, s.R, l)
+            for i in range(n):
+                total = 0.0
+                for j in range(i, n):
+                    total += s.R[i, j, l] * s.R[i, j, l]
+                s.var[i, l] = total
+        for l in range(count):
+            rho[first + l], c[first + l] = s.rho[l], s.c[l]
+            for i in range(n):
+                theta[first + l, i] = s.x[i, l]
+                var[first + l, i] = s.var[i, l]
+        if inverse.shape[0] > 0:
+            for l in range(count):
+                for i in range(n):
                     for j in range(n):
-                        s.row[j, l] = block.S[1, k + j - i, l] if j >= i else 0.0
-                    absorb(s.S, s.d, s.row, block.d[1, i, l], l)
-                k += n - i
-            # rotate in the sample itself: rho and the cosine c give residual and leverage
-            for l in range(count):
-                for i in range(n):
-                    s.row[i, l] = samples[first + l, i]
-                s.y[l] = samples[first + l, n]
-            for l in range(width):
-                s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
-            # theta = S^-1 d, and its variances from R = S^-1
-            for l in range(width):
-                solve(s.S, s.d, s.x, l)
-                invert(s.S, s.R, l)
-                for i in range(n):
-                    total = 0.0
-                    for j in range(i, n):
-                        total += s.R[i, j, l] * s.R[i, j, l]
-                    s.var[i, l] = total
-            for l in range(count):
-                rho[first + l], c[first + l] = s.rho[l], s.c[l]
-                for i in range(n):
-                    theta[first + l, i] = s.x[i, l]
-                    var[first + l, i] = s.var[i, l]
-            if inverse.shape[0] > 0:
-                for l in range(count):
-                    for i in range(n):
-                        for j in range(n):
-                            inverse[first + l, i, j] = s.R[i, j, l]
-
-    return meet
+                        inverse[first + l, i, j] = s.R[i, j, l]

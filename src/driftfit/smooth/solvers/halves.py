@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, State, kernel, part
 from driftfit.engine.simd import entry, higher, lower, minus, only, over, pair, plus, put_pair, times, two
-from driftfit.smooth.parts.walk import DRIFT, WEIGHT, Y
+from driftfit.smooth.solvers.walk import DRIFT, WEIGHT, Y
 
 BLOCK = 64
 """Steps that are eliminated again at a time."""
@@ -36,7 +36,7 @@ class Samples(NamedTuple):
 
     phi: Array
     signals: Array
-    """(T, 3 or more), see `driftfit.smooth.parts.walk.Walk`."""
+    """(T, 3 or more), see `driftfit.smooth.solvers.walk.Walk`."""
     drift_root: Array
     """(T, n), or (1, n) of ones."""
 
@@ -55,17 +55,6 @@ class Found(NamedTuple):
     rho: Array
     """(T,), or empty, as ``c``."""
     c: Array
-
-
-class Sums(NamedTuple):
-    """What the loops add up on the way back."""
-
-    cost: float
-    measurement_cost: float
-    spread: float
-    """phi' C phi of the used samples."""
-    doubtful: int
-    """Samples of which 1 - h is too small, or a variance is not positive."""
 
 
 @lru_cache
@@ -285,7 +274,11 @@ def back(s: State, i: int, row: int) -> Any:
 
 @Driver
 def outwards(work: Array, samples: Any, K: int, kept: Array, found: Any) -> tuple[float, float, float, int]:
-    """Run both halves back from theta and C of the middle in the scratch space; returns `Sums`."""
+    """Run both halves back from theta and C of the middle in the scratch space.
+
+    Returns the cost and the part of it that is measured, the sum of phi' C phi over the used samples, and the number of
+    samples of which 1 - h is too small, or a variance is not positive.
+    """
     s = work[0]
     n, T = s.q.shape[0], samples.phi.shape[0]
     moved, measured, spread, doubtful = same(0.0), 0.0, 0.0, 0

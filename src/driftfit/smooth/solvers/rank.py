@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.smooth.parts.walk import WEIGHT
-from driftfit.trackers.forms import diffuse
-
-FAR = 1e250
-"""Sums of squares between this and its inverse have lost nothing to overflow or underflow."""
+from driftfit.smooth.solvers.walk import WEIGHT
+from driftfit.trackers.forms.diffuse import ROW, WORK, outside, refresh, turn_in
 
 
 def column_sizes(phi: Array, total: Any = np.mean) -> Array:
@@ -29,7 +25,7 @@ def column_sizes(phi: Array, total: Any = np.mean) -> Array:
 def column_scale(phi: Array, signals: Array) -> Array:
     """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros.
 
-    ``signals`` are those of a `driftfit.smooth.parts.walk.Walk`.
+    ``signals`` are those of a `driftfit.smooth.solvers.walk.Walk`.
     """
     T, n = phi.shape
     top, squares, scale, count = np.zeros(n), np.zeros(n), np.ones(n), 0
@@ -37,21 +33,8 @@ def column_scale(phi: Array, signals: Array) -> Array:
         if signals[t, WEIGHT] > 0.0:
             count += 1
             for i in range(n):
-                squares[i] += phi[t, i] ** 2
-    ordinary = True
-    for i in range(n):
-        ordinary = ordinary and 1.0 / FAR < squares[i] < FAR
-        scale[i] = np.sqrt(squares[i] / count) if ordinary else 1.0
-    if ordinary:
-        return scale
-    # squares of very large or small numbers, or of zeros: in a unit in which the largest is about 1
-    for t in range(T):
-        if signals[t, WEIGHT] > 0.0:
-            for i in range(n):
                 top[i] = max(top[i], abs(phi[t, i]))
-    for i in range(n):
-        squares[i], scale[i] = 0.0, 1.0
-    for i in range(n):
+    for i in range(n):  # a unit in which the largest is about 1: squares neither overflow nor vanish
         if top[i] > 0.0:
             scale[i] = 2.0 ** -max(-1000.0, min(1000.0, np.floor(np.log2(top[i]))))  # exact in the products
     for t in range(T):
@@ -68,30 +51,24 @@ def ranks(phi: Array, signals: Array, scale: Array) -> tuple[Array, Array]:
     n = len(scale)
     rank = np.full(len(phi), n, np.int16)
     S, R = np.zeros((n, n)), np.eye(n)
-    compiled_ranks()(S, R, np.zeros((diffuse.WORK, n)), phi, scale, signals, rank)
+    run_ranks(S, R, np.zeros((WORK, n)), phi, scale, signals, rank)
     return rank, R[:, np.diag(S) == 0.0]
 
 
-@lru_cache
-def compiled_ranks() -> Any:
-    refresh, outside, turn_in, row = diffuse.refresh, diffuse.outside, diffuse.turn_in, diffuse.ROW
-
-    @Driver
-    def run(S: Array, R: Array, work: Array, phi: Array, scale: Array, signals: Array, rank: Array) -> None:
-        n, known = len(scale), 0
-        scaled, values = np.empty(n), np.zeros(n)
-        for t in range(phi.shape[0]):
-            if known == n:
-                break
-            if signals[t, WEIGHT] > 0.0:
-                for i in range(n):
-                    scaled[i] = phi[t, i] / scale[i]
-                entering, _, _ = outside(scaled, S, work)
-                for i in range(n):
-                    work[row, i] = scaled[i]
-                turn_in(S, values, work[row], 0.0, entering)
-                refresh(S, R, work)
-                known += 1 if entering >= 0 else 0
-            rank[t] = known
-
-    return run
+@Driver
+def run_ranks(S: Array, R: Array, work: Array, phi: Array, scale: Array, signals: Array, rank: Array) -> None:
+    n, known = len(scale), 0
+    scaled, values = np.empty(n), np.zeros(n)
+    for t in range(phi.shape[0]):
+        if known == n:
+            break
+        if signals[t, WEIGHT] > 0.0:
+            for i in range(n):
+                scaled[i] = phi[t, i] / scale[i]
+            entering, _, _ = outside(scaled, S, work)
+            for i in range(n):
+                work[ROW, i] = scaled[i]
+            turn_in(S, values, work[ROW], 0.0, entering)
+            refresh(S, R, work)
+            known += 1 if entering >= 0 else 0
+        rank[t] = known

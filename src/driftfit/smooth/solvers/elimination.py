@@ -11,13 +11,13 @@ has variance g = q_i drift_t drift_root_ti^2, and leaves
 between which the sample adds w phi phi' to U and w phi y to z. This is the recursion of flexible least squares,
 theta_t = e_t + M_t theta_{t+1}, with M_t as a product of n steps, so O(n^2) for means and no matrix to invert. A random
 walk has no direction of time: the same recursion runs from the last sample backwards, and where the two meet U and z
-are the sums of both (`driftfit.smooth.parts.halves`). A proper prior adds its term of J when theta_0 has been found.
+are the sums of both (`driftfit.smooth.solvers.halves`). A proper prior adds its term of J when theta_0 has been found.
 
 Test: together with z, the recursion carries the information of a second record, which the constant path 1 / (rms of
 each regressor) produces without noise. The largest difference of its solution from that path estimates the relative
 error of all solutions with these regressors, weights and drifts. The result is accepted if it is small, no step
 cancelled more than six digits (f), and no sample has a leverage so close to 1 that its leave-one-out residual is lost.
-Otherwise `driftfit.smooth.parts.two_filters` solves the problem; drift far above the noise and collinear regressors
+Otherwise `driftfit.smooth.solvers.two_filters` solves the problem; drift far above the noise and collinear regressors
 fail the test.
 
 Sources: Kalaba and Tesfatsion (1989); Higham (2002), section 1.3, for problems of known solution. Cost: O(T n^3),
@@ -29,8 +29,8 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.smooth.parts.halves import BLOCK, Found, Samples, Sums, inwards, outwards, workspace
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.solvers.halves import BLOCK, Found, Samples, inwards, outwards, workspace
+from driftfit.smooth.solvers.walk import Path, Walk
 
 ERROR = 1e-10
 """Largest error of the known path, relative to its values."""
@@ -46,16 +46,8 @@ def smooth(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False)
     """Solve a problem with a diagonal q and regressors of full rank; None if the result is not accurate enough.
 
     ``scale`` (n,) is the size of each regressor. With keep="fit" the path has rho and c. ``overwrite``: phi and signals
-    take the solution, which saves memory.
-    """
-    solved = smooth_and_weigh(walk, scale, keep, overwrite)
-    return None if solved is None else solved[0]
-
-
-def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", overwrite: bool = False) -> tuple[Path, float] | None:
-    """The same, and the log of the likelihood of y given q, drift, weights and the start, up to a constant.
-
-    With U of the middle sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
+    take the solution, which saves memory. With U of the middle sample, -2 log L = J + log |U| - sum log f, since each f
+    is 1 / (1 + g U_ii).
     """
     T, n = walk.phi.shape
     K = T // 2 + 1
@@ -81,16 +73,18 @@ def smooth_and_weigh(walk: Walk, scale: Array, keep: str = "std", overwrite: boo
     theta, var = (samples.signals, samples.phi) if overwrite else (np.empty((T, n)), np.empty((T, n)))
     of_fit = T if keep == "fit" else 0
     found = Found(theta, var, np.empty(of_fit), np.empty(of_fit))
-    sums = Sums(*outwards(work, samples, K, kept, found))
+    cost, measured, spread, doubtful = outwards(work, samples, K, kept, found)
     error = float((work["error"][0] * scale[:, None]).max())
-    if not (error <= ERROR and sums.doubtful == 0):
+    if not (error <= ERROR and doubtful == 0):
         return None
     empty = np.zeros((0, n, n))
     theta = np.ascontiguousarray(theta[:, :n])
     away = work["theta"][0, :, 0] - walk.theta0
-    cost = sums.cost + float(away @ before @ away)
-    path = Path(theta, var, found.rho, found.c, cost, sums.measurement_cost, sums.spread, empty, empty, "fast")
-    return path, -0.5 * (cost + volume)
+    cost += float(away @ before @ away)
+    return Path(
+        theta, var, found.rho, found.c, cost, measured, spread, empty, empty, "fast",
+        log_likelihood=-0.5 * (cost + volume),
+    )  # fmt: skip
 
 
 def inverse(U: Array, limit: float = np.inf) -> Array | None:

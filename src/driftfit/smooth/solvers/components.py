@@ -32,20 +32,13 @@ JOIN, SQUEEZE = 1e-3, 100.0
 beyond `ROOMY`; and the factor of it when there is no room."""
 
 
-class Components(NamedTuple):
-    """K components."""
+class Filter(NamedTuple):
+    """The present K components of a filter."""
 
     A: Array
     """(K, n, n + 1): [S | d]."""
     facts: Array
     """(K, 5): `LOG` to `SHARE`."""
-
-
-class Filter(NamedTuple):
-    """The present components of a filter."""
-
-    A: Array
-    facts: Array
     many: Array
     """(1,): the number of components."""
     level: Array
@@ -60,8 +53,7 @@ class Moves(NamedTuple):
     begin: Array
     """(S + 1,): the first move out of each mode."""
     kind: Array
-    """(M, 6): the mode that is entered; the event, 0 for none; the roots of the drift and of the event, -1 for none;
-    the columns of the factors of either."""
+    """(M, 4): the mode that is entered; the event, 0 for none; its root, after that of a drift if there is one (-1)."""
     log_prob: Array
     """(U, M): U tables of log probabilities."""
     roots: Array
@@ -80,7 +72,8 @@ class Noises(NamedTuple):
 class Room(NamedTuple):
     """Scratch space: children, their order, factors of kept components, facts of merging, squares, a row, and odds."""
 
-    children: Components
+    born: Array
+    born_facts: Array
     order: Array
     factors: Array
     merged: Array
@@ -92,10 +85,9 @@ class Room(NamedTuple):
 def room_for(n: int, most: int, children: int) -> Room:
     """Scratch space for so many components, and children of each."""
     C = most * children
-    born = Components(np.empty((C, n, n + 1)), np.empty((C, 5)))
     return Room(
-        born, np.empty(C, np.int64), np.empty((most + 1, n, n + 1)), np.empty((most, 3)), np.zeros((4, n, n + 1)),
-        np.empty(n + 1), np.empty(children + 1),
+        np.empty((C, n, n + 1)), np.empty((C, 5)), np.empty(C, np.int64), np.empty((most + 1, n, n + 1)),
+        np.empty((most, 3)), np.zeros((4, n, n + 1)), np.empty(n + 1), np.empty(children + 1),
     )  # fmt: skip
 
 
@@ -183,25 +175,24 @@ def grow(K: int, now: Filter, moves: Moves, logp: Array, sizes: Array, room: Roo
 
     A move with the drift of the move before it takes what that made of the component.
     """
-    X, facts, Y, more, row, drifted = now.A, now.facts, room.children.A, room.children.facts, room.row, room.squares[0]
+    X, facts, Y, more, row, drifted = now.A, now.facts, room.born, room.born_facts, room.row, room.squares[0]
     C, best = 0, -np.inf
     for k in range(K):
         best = max(best, facts[k, SHARE])
     for k in range(K):
-        mode, drift, column, lower = int(facts[k, MODE]), -2, -1, 0.0
+        mode, drift, lower = int(facts[k, MODE]), -1, 0.0
         for at in range(moves.begin[mode], moves.begin[mode + 1]):
             if facts[k, SHARE] + logp[at] < best - UNLIKELY:
                 continue
             kind = moves.kind[at]
-            if kind[2] != drift or kind[-2] != column:
-                drift, column, lower = kind[2], kind[-2], 0.0
+            if kind[2] != drift:
+                drift = kind[2]
                 copy_upper(X[k], drifted)
-                if drift >= 0:
-                    lower = convolve(drifted, moves.roots[drift], sizes[column], row)
+                lower = convolve(drifted, moves.roots[drift], sizes[drift], row)
             copy_upper(drifted, Y[C])
             c = facts[k, LOG] + logp[at] - lower
-            if kind[1 + 2] >= 0:
-                c -= convolve(Y[C], moves.roots[kind[1 + 2]], sizes[kind[-1]], row)
+            if kind[3] >= 0:
+                c -= convolve(Y[C], moves.roots[kind[3]], sizes[kind[3]], row)
             more[C, LOG], more[C, MODE], more[C, MOVE] = c, kind[0], at
             more[C, COST], more[C, SHARE] = facts[k, COST], facts[k, SHARE] + logp[at]
             C += 1
@@ -225,7 +216,7 @@ def observe(C: int, room: Room, phi: Array, y: float, r: float, noises: Noises, 
     Each is updated by every noise that has at least `MINOR` of its probability; the others count as the first. The
     probability of others than the first is added to ``now.spikes``.
     """
-    Y, more, kind, p, copy = room.children.A, room.children.facts, noises.kind, room.odds, room.squares[0]
+    Y, more, kind, p, copy = room.born, room.born_facts, noises.kind, room.odds, room.squares[0]
     count, L, others, everything, best = C, len(kind), 0.0, 0.0, -np.inf
     unit = np.log(r * kind[0, 0])
     for k in range(C):
@@ -365,7 +356,7 @@ def ranked(C: int, shares: Array, order: Array) -> int:
 @shared
 def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> int:
     """The component of the same mode from which child k has the least divergence below the limit, or -1."""
-    more, merged, n, most = room.children.facts, room.merged, now.A.shape[1], len(now.A)
+    more, merged, n, most = room.born_facts, room.merged, now.A.shape[1], len(now.A)
     to, least, logs = -1, limit, more[k, LOG] - more[k, SHARE]
     for j in range(N):
         if now.facts[j, MODE] == more[k, MODE]:
@@ -379,7 +370,7 @@ def nearest(N: int, now: Filter, room: Room, k: int, limit: float) -> int:
 @shared
 def reduce(C: int, room: Room, keep: int, now: Filter) -> int:
     """C children, the largest first, to at most ``keep`` components; returns their number."""
-    Y, more, order, merged, scratch = room.children.A, room.children.facts, room.order, room.merged, room.factors
+    Y, more, order, merged, scratch = room.born, room.born_facts, room.order, room.merged, room.factors
     X, facts, n, N = now.A, now.facts, now.A.shape[1], 0
     join = JOIN * (ROOMY / max(keep, ROOMY)) ** 2
     count = ranked(C, more[:, SHARE], order)

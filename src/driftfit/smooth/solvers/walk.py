@@ -167,6 +167,8 @@ class Path(NamedTuple):
     """(T, n), per nominal interval; empty if theta has no slope."""
     slope_var: Array = NONE
     """(T, n), or empty."""
+    log_likelihood: float = np.nan
+    """Of y given q, drift, weights and the start, up to a constant; only the fast method computes it."""
 
 
 def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:

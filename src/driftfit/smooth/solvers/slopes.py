@@ -8,7 +8,7 @@ theta_t - 2 theta_{t-1} + theta_{t-2}. As a problem of 2 n parameters x_t = (the
 
     x_t = F_t x_{t-1} + (trend_t, 1) w_t,   F_t = [[1, trend_t], [0, 1]],   w_t ~ N(0, r drift_t E_t q E_t)
 
-which the two filters of `driftfit.smooth.parts.two_filters` solve, with a shear of the triangle for F_t.
+which the two filters of `driftfit.smooth.solvers.two_filters` solve, with a shear of the triangle for F_t.
 
 A straight line costs nothing, so 2 n directions must be determined. The regressors of x at the first sample are
 (phi_t, tau_t phi_t), with tau_t the time since then: two samples are needed for each direction of theta. Directions
@@ -26,9 +26,10 @@ random walk that the tracker has estimated, squared as its drift ratio alpha^2 b
 
     log L = -1/2 sum (log f_t + min(e_t^2 / f_t, 16)),    e_t, f_t the innovations of a Kalman filter of level and slope
 
-that is compared with the one of the random walk, from the same filter and the same prior of the level, which is `FAR`
-standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record. Slopes are not
-considered if one of `PARTS` equal parts of the record is all that speaks for them: it may be a jump or a fault.
+that is compared with the one of the random walk, from the same filter and the same prior of the level, which is
+`LEVEL_STD` standard deviations of the noise wide; that of the slope is as wide as what it moves in the whole record.
+Slopes are not considered if one of `EQUAL_PARTS` parts of the record is all that speaks for them: it may be a jump or a
+fault.
 
 Source: West and Harrison, Bayesian Forecasting and Dynamic Models (1997), chapter 7, for the model and its likelihood.
 Cost: O(T n^2) for each of the likelihoods.
@@ -39,17 +40,17 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.smooth.parts import two_filters
-from driftfit.smooth.parts.rank import column_scale, ranks
-from driftfit.smooth.parts.two_filters import Start, unspanned
-from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.solvers import two_filters
+from driftfit.smooth.solvers.rank import column_scale, ranks
+from driftfit.smooth.solvers.two_filters import Start, unspanned
+from driftfit.smooth.solvers.walk import Path, Walk
 from driftfit.trackers.forms.information import triangular_root
 
 RATIOS = 10.0 ** np.arange(-10.0, -1.0)
-FAR = 100.0
-MOST = 16.0
+LEVEL_STD = 100.0
+LARGEST_SQUARE = 16.0
 """The largest e^2 / f that counts, so that a single sample decides nothing."""
-PARTS = 8
+EQUAL_PARTS = 8
 
 
 def smooth(walk: Walk, keep: str = "std") -> Path:
@@ -89,13 +90,8 @@ def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
     at_first = np.hstack([walk.phi, walk.phi * (time / span)[:, None]])
     rank, unseen = ranks(at_first, walk.signals, double)
     n = len(double) // 2
-    hidden = np.zeros(len(double), bool)
-    if rank[-1] == 2 * n:
-        return rank, Start(np.zeros((0, 2 * n)), np.zeros(0), hidden)
     natural = unspanned(unseen, double * np.repeat([1.0, span], n))
-    rows = natural / double
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return rank, Start(rows, rows[:, :n] @ (double[:n] * walk.theta0), undetermined(natural, time))
+    return rank, Start.fixing(natural, double, double[:n] * walk.theta0, undetermined(natural, time))
 
 
 def moved(rows: Array, time: float) -> Array:
@@ -148,7 +144,7 @@ def log_likelihood(samples: Array, level: Array, slope: Array, trend: Array, m: 
             for i in range(n):
                 e -= samples[t, i] * m[i]
                 f += samples[t, i] * g[i]
-            total[t * parts // T] -= 0.5 * (np.log(f * weight) + min(e * e / f, MOST))
+            total[t * parts // T] -= 0.5 * (np.log(f * weight) + min(e * e / f, LARGEST_SQUARE))
             for i in range(2 * n):
                 m[i] += g[i] * e / f
                 for j in range(2 * n):
@@ -171,8 +167,8 @@ def compared(walk: Walk, trend: Array, start: Array) -> tuple[Array, Array]:
     rates = r * np.concatenate([RATIOS[:, None] * share for share in (np.ones(n), alone)])
 
     def weigh(moves: Array, rate: Array) -> Array:
-        total = np.zeros(PARTS)
-        m, wide = np.append(start * size, np.zeros(n)), np.append(np.full(n, FAR**2 * r), rate * trend.sum())
+        total = np.zeros(EQUAL_PARTS)
+        m, wide = np.append(start * size, np.zeros(n)), np.append(np.full(n, LEVEL_STD**2 * r), rate * trend.sum())
         log_likelihood(samples, moves, rate, trend, m, np.diag(wide), total)
         return total
 
