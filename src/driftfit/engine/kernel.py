@@ -48,7 +48,7 @@ Step = Callable[[State, int], None]
 """A compiled step, called with the record and a lane."""
 
 
-_MADE: WeakValueDictionary[Any, Any] = WeakValueDictionary()
+MADE: WeakValueDictionary[Any, Any] = WeakValueDictionary()
 """Compiled functions by identity and options: closures are made anew for each set of stored results, and for streams,
 but not compiled anew."""
 
@@ -60,7 +60,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = F
     assert isinstance(function, FunctionType)
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}{'short' * short}".encode()).hexdigest()
     key = name, cache, tuple(sorted(options.items()))
-    known = _MADE.get(key)
+    known = MADE.get(key)
     if known is not None:
         return known
     if cache:
@@ -78,7 +78,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = F
             dispatcher, lambda sig: disk_cache.read(file(sig)), lambda sig, data: disk_cache.write(file(sig), data)
         )
     internals.name_for_pickle(dispatcher, name)
-    _MADE[key] = dispatcher
+    MADE[key] = dispatcher
     return dispatcher
 
 
