@@ -62,15 +62,10 @@ def _late(tracker: Any) -> Any:
     return kernel(late, inline=False)
 
 
-@kernel
-def none_late(s: State, l: int) -> None:
-    """All samples are taken in at once."""
-
-
 def _wide_samples(tracker: Any) -> tuple[bool, Step, Any]:
     """Whether the start takes in what a covariance cannot, the step that finds it, and the one that takes it in."""
     if tracker.start is None or tracker.start.take_over is None:
-        return False, none_late, nothing
+        return False, nothing, nothing
     return True, keeps_digits, _late(tracker)
 
 
@@ -84,6 +79,22 @@ def floored(s: State, l: int) -> None:
 def taken_in(s: State, l: int) -> None:
     """The form of the start takes every sample in."""
     s.late[l] = 0.0
+
+
+def _corrected(before: Step, steps: Any, check: Step, bounded: bool = False) -> Step:
+    """The correction of one lane and its report, after the step ``before``; ``bounded`` where a scale has a floor."""
+    correct, report = steps.correct, steps.report
+
+    @kernel
+    def corrected(s: State, l: int) -> None:
+        before(s, l)
+        check(s, l)
+        correct(s, l)
+        if bounded:  # a constant
+            floored(s, l)
+        report(s, l)
+
+    return corrected  # type: ignore[no-any-return]
 
 
 def _with_start(usual: Any, tracker: Any, first: Step | None, other: Step, after: Any = None) -> Any:
@@ -151,20 +162,9 @@ def advancing(tracker: Any) -> Any:
             if some > 0.0:
                 called(s)
 
-    def one_lane(steps: Any, check: Step) -> Step:
-        forecasts, correct, report = forecasting(steps), steps.correct, steps.report
-
-        @kernel
-        def one(s: State, l: int) -> None:
-            forecasts(s, l)
-            check(s, l)
-            correct(s, l)
-            report(s, l)
-
-        return one  # type: ignore[no-any-return]
-
-    first = tracker.start and one_lane(tracker.start, taken_in)
-    return _with_start(advance, tracker, first, one_lane(tracker, check), late if both else None)
+    first = tracker.start and _corrected(forecasting(tracker.start), tracker.start, taken_in)
+    other = _corrected(forecasting(tracker), tracker, check)
+    return _with_start(advance, tracker, first, other, late if both else None)
 
 
 def looking(tracker: Any) -> Any:
@@ -185,23 +185,7 @@ def learning(tracker: Any) -> Any:
     """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
     both, check, late = _wide_samples(tracker)
     called = late if tracker.outlined else outlined(late, short=True)
-    bounded = tracker.learns_scale
-
-    def corrected(steps: Any, check: Step) -> Step:
-        variance, correct, report = steps.variance, steps.correct, steps.report
-
-        @kernel
-        def corrects(s: State, l: int) -> None:
-            variance(s, l)
-            check(s, l)
-            correct(s, l)
-            if bounded:  # a constant
-                floored(s, l)
-            report(s, l)
-
-        return corrects  # type: ignore[no-any-return]
-
-    usual = corrected(tracker, check)
+    usual = _corrected(tracker.variance, tracker, check, tracker.learns_scale)
 
     @kernel
     def learn(s: State) -> None:
@@ -214,7 +198,7 @@ def learning(tracker: Any) -> Any:
             if some > 0.0:
                 called(s)
 
-    first = tracker.start and corrected(tracker.start, taken_in)
+    first = tracker.start and _corrected(tracker.start.variance, tracker.start, taken_in, tracker.learns_scale)
     return _with_start(learn, tracker, first, usual, late if both else None)
 
 
