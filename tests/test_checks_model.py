@@ -37,7 +37,7 @@ READY = {
     "ARX": (ARX(1, [1, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(3, intercept=True), None),
     "HammersteinWiener": (CURVED, SYSTEM),
     "PolynomialModel": (
-        PolynomialModel(1, [1, 1], 1, 1, [1, 1], nk=[1, 2], offset=True), (0.5, 1.0, 0.5, 0.9, 0.7, 0.3, 0.2, 3.0)
+        PolynomialModel(1, [1, 1], 1, 1, [1, 0], nk=[1, 2], offset=True), (0.5, 1.0, 0.5, 0.9, 0.7, 0.3, 3.0)
     ),
     "ContinuousTransfer": (ContinuousTransfer(2, 1, delay=1, dt=0.5, inputs=1), (1.5, 1.0, 0.5, 2.0)),
     "StateSpace": (StateSpace(SPACE), (0.5, 0.3, 0.2)),

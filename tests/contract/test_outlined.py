@@ -122,5 +122,6 @@ def test_both_are_found_on_disk_and_a_driver_whose_step_was_lost_is_compiled_aga
         path.unlink()
     for known in ("SOURCES", "LINKED"):  # as in a process that has compiled nothing
         monkeypatch.setattr(f"driftfit.engine.outlined.{known}", {})
+    monkeypatch.setattr(kernel, "MADE", {})
     assert predictions(Regression(1)) == [1.0]
     assert [name.split("_")[0] for name in compiled[before:]] == ["run", "outlined", "outlined"]

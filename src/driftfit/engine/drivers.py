@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import advancing, gated, learning, looking, raw_kept, ungated
+from driftfit.engine.phases import advancing, judging, learning, looking
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -236,15 +236,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     part = whole_record if tracker.reads_model else tracker_part
     phases: tuple[Any, ...] = looking(tracker), learning(tracker)
     phases = tuple(map(outlined, phases)) if tracker.outlined else phases if gate else (advancing(tracker),)
-    if gate is None:
-        between = ungated(phases, part)
-    else:
-        between, model = gated(phases[0], phases[1], gate, part, model), model._replace(regress=raw_kept(model.regress))
-    sample = _sample(model, tracker.note, between, part)
+    sample = _sample(model, tracker.note, phases, gate and judging(gate, model), part)
     keep_more = covariance if keep == "cov" else nothing_more
-    common = nothing_common if keep == "own" else write_common
     store = tracker.store if gate is None or keep == "own" else stored_too(tracker.store, store_decision)
-    run = _run(sample, tracker.read_extra, _written(common, store, keep_more, part), part, gate is not None)
+    run = _run(sample, tracker.read_extra, _written(keep != "own", store, keep_more, part), part, gate is not None)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array = NOWHERE) -> int:
         # nothing looks at types and bounds after this
@@ -292,63 +287,56 @@ def stored_too(first: Any, then: Any) -> Any:
     return both
 
 
-@kernel
-def write_common(o: State, s: State) -> None:
-    """The results of every tracker."""
-    n, L = s.theta.shape
-    for i in range(n):
-        for l in range(L):
-            o.theta[i, l] = s.theta[i, l]
-    for i in range(n):
-        for l in range(L):
-            o.var[i, l] = s.var[i, l]
-    for l in range(L):
-        o.y_hat[l] = s.y_hat[l]
-        o.e[l] = s.e[l]
-        o.s[l] = s.s[l]
-        o.ok[l] = s.ok[l]
-
-
-@kernel
-def store_theta(s: State, theta: Array, t: int) -> None:
-    """theta alone, as row t of theta (T, n, L)."""
-    n, L = s.theta.shape
-    for i in range(n):
-        for l in range(L):
-            theta[t, i, l] = s.theta[i, l]
-
-
-@kernel
-def nothing_common(o: State, s: State) -> None:
-    """Only the tracker's own results are written."""
-
-
-def _written(common: Any, store: Any, keep_more: Any, part: Any) -> Any:
-    """What is kept of a sample."""
+def _written(common: bool, store: Any, keep_more: Any, part: Any) -> Any:
+    """What is kept of a sample: the results of every tracker if they are ``common``, and more."""
+    stores, keeps = store is not nothing_more, keep_more is not nothing_more
 
     @kernel
     def write(o: State, s: State) -> None:
-        common(o, s)
-        for l in range(s.theta.shape[1]):
-            store(o, part(s), l)
-            keep_more(o, part(s), l)
+        n, L = s.theta.shape
+        if common:  # a constant, as the two below
+            for i in range(n):
+                for l in range(L):
+                    o.theta[i, l] = s.theta[i, l]
+            for i in range(n):
+                for l in range(L):
+                    o.var[i, l] = s.var[i, l]
+            for l in range(L):
+                o.y_hat[l] = s.y_hat[l]
+                o.e[l] = s.e[l]
+                o.s[l] = s.s[l]
+                o.ok[l] = s.ok[l]
+        if stores:
+            for l in range(L):
+                store(o, part(s), l)
+        if keeps:
+            for l in range(L):
+                keep_more(o, part(s), l)
 
     return write
 
 
-def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
-    """One sample of all lanes, whose signals and known factors are in the record; ``between`` is what the tracker and
-    the gate do between the regression and the lags."""
-    regress, push = model.regress, model.push
+def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, part: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record. Between the regression and the lags
+    are the ``phases`` of the tracker, one or two, and the gate after the first."""
+    regress, push, notes, judged = model.regress, model.push, note is not nothing, judge is not None
+    first, last, two = phases[0], phases[-1], len(phases) > 1
 
     @kernel
     def sample(s: State) -> None:
         L = s.theta.shape[1]
         for l in range(L):
+            if judged:  # a constant; the model may put a function of the reading in its place
+                s.raw_y[l] = s.y[l]
             regress(s, l)
             clean(tracker_part(s), l)
-            note(part(s), l)
-        between(s)
+            if notes:  # a constant
+                note(part(s), l)
+        first(part(s))
+        if judged:
+            judge(s)
+        if two:  # a constant
+            last(part(s))
         for l in range(L):
             push(s, l)
         for l in range(L):
@@ -362,6 +350,7 @@ def _sample(model: ModelSteps, note: Step, between: Any, part: Any) -> Any:
 
 def _run(sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> Driver:
     """The loop over the samples of a record, which a gate may end early."""
+    extra = read_extra is not nothing_extra
 
     @Driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array, theta: Array) -> int:
@@ -378,7 +367,7 @@ def _run(sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> D
                 s.dt[l] = known[t * changing, INTERVAL, l]
                 s.noise[l] = known[t * changing, NOISE, l]
                 s.drift[l] = known[t * changing, DRIFT, l]
-            if known.shape[1] > COMMON:
+            if extra and known.shape[1] > COMMON:
                 for l in range(L):
                     read_extra(part(s), known, t, l)
             if given:
@@ -387,7 +376,9 @@ def _run(sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> D
                         s.u[j, l] = u[t, j, l]
             sample(s)
             if alone:
-                store_theta(s, theta, t)
+                for i in range(s.theta.shape[0]):
+                    for l in range(L):
+                        theta[t, i, l] = s.theta[i, l]
             if not alone or t == last:
                 write(out[t * kept], s)
             if judged:  # a constant, without which the field would be missing  # noqa: SIM102

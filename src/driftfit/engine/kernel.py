@@ -26,7 +26,7 @@ from operator import attrgetter
 from threading import Lock
 from types import FunctionType
 from typing import Any
-from weakref import ref
+from weakref import WeakValueDictionary, ref
 
 import numba
 import numpy as np
@@ -48,12 +48,21 @@ Step = Callable[[State, int], None]
 """A compiled step, called with the record and a lane."""
 
 
+MADE: WeakValueDictionary[Any, Any] = WeakValueDictionary()
+"""Compiled functions by identity and options: closures are made anew for each set of stored results, and for streams,
+but not compiled anew."""
+
+
 def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = False, **options: bool) -> Any:
     """Compile under IEEE rules and without the GIL; its identity names it in the cache on disk. Whether its code is
     ``short`` is for the caller to see to.
     """
     assert isinstance(function, FunctionType)
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}{'short' * short}".encode()).hexdigest()
+    key = name, cache, tuple(sorted(options.items()))
+    known = MADE.get(key)
+    if known is not None:
+        return known
     if cache:
         source = function
         defaults, closure = source.__defaults__, source.__closure__
@@ -69,6 +78,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, short: bool = F
             dispatcher, lambda sig: disk_cache.read(file(sig)), lambda sig, data: disk_cache.write(file(sig), data)
         )
     internals.name_for_pickle(dispatcher, name)
+    MADE[key] = dispatcher
     return dispatcher
 
 

@@ -31,19 +31,19 @@ LINKED: WeakValueDictionary[str, internals.Linked] = WeakValueDictionary()
 """Outlined steps that drivers of this process use, by symbol."""
 
 
-def outlined(step: Any, short: bool = False) -> Any:
+def outlined(step: Any, short: bool = False, lanes: Any = None) -> Any:
     """A step, which takes the record only, as drivers call it. For one lane it is compiled once for all sizes of the
     record (`driftfit.engine.compile_time.open_record`), and for size if it is ``short`` because it seldom runs; for
-    several lanes it is compiled once for each size.
+    several lanes it is compiled once for each size, or ``lanes`` in its place.
     """
-    named = names_in(step.py_func)
+    named, lanes = names_in(step.py_func), lanes or step
 
     def typed(context: Any, record: Any) -> Any:
         known = record.fields["theta"].type.shape[-1] > 1
         fields = {name: record.fields[name] for name in sorted(named & record.fields.keys())} or record.fields
-        taken = record if known else internals.OpenRecord(fields)
-        symbol = disk_cache.name_of(PREFIX.rstrip("-"), step.identity, taken)
-        SOURCES[symbol] = step.py_func, taken, short and not known
+        taken, used = (record, lanes) if known else (internals.OpenRecord(fields), step)
+        symbol = disk_cache.name_of(PREFIX.rstrip("-"), used.identity, taken)
+        SOURCES[symbol] = used.py_func, taken, short and not known
 
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             argument = given if known else [internals.opened(context, builder, fields, given[0])]
@@ -51,7 +51,7 @@ def outlined(step: Any, short: bool = False) -> Any:
 
         return types.none(record), build
 
-    made = internals.named_intrinsic(f"outlined.{step.identity}", typed)
+    made = internals.named_intrinsic(f"outlined.{step.identity}.{lanes.identity}", typed)
     made.py_func = step.py_func
     return made
 

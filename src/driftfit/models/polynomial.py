@@ -91,6 +91,20 @@ def hold_before(s: State, signal: int, age: int, l: int) -> None:
 
 
 @lru_cache
+def taking_late(take_inputs: Step) -> Step:
+    """`Model.apply`: where a record takes the inputs in, their sample has not been counted yet."""
+
+    @kernel
+    def take_late(s: State, l: int) -> None:
+        counted = s.ok[l] * s.moved_on[l]
+        s.usable[l] -= counted
+        take_inputs(s, l)
+        s.usable[l] += counted
+
+    return take_late  # type: ignore[no-any-return]
+
+
+@lru_cache
 def refusing(p: Places) -> Any:
     """`Model.refuse`: the input before is held, and the response w since then is without that to the difference."""
     n, m, nb, nf, nk, at_b, at_f = p.n, p.m, p.nb, p.nf, p.nk, p.at_b, p.at_f
@@ -268,7 +282,7 @@ class PolynomialModel(LinearisedTransfer):
     @property
     def apply(self) -> Step | None:
         late = all(nk > 0 for _, _, nk in self.orders)
-        return taking_inputs(self._places) if late else None
+        return taking_late(taking_inputs(self._places)) if late else None
 
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of C / (A D) to an impulse, (h,)."""
