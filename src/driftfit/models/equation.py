@@ -39,11 +39,11 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.models.base import GAP, refuse_lag
+from driftfit.models.base import GAP
 from driftfit.models.formula import Formula, compiled, parse, start_values
 from driftfit.models.inputs import NamedInputs
-from driftfit.models.lags import shift_inputs
-from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
+from driftfit.models.lags import informed, refuse_lag, shift_inputs
+from driftfit.models.linearised import MEMORY, along, restore, subtract
 
 SETTLING = 10.0
 """Usable samples for each parameter in which the point of linearisation goes from the start to the estimate."""
@@ -97,14 +97,6 @@ class Equation(NamedInputs):
             given = dict(self.start)
             return np.array([given.get(name, 1.0) for name in self.names])
         return np.full(self.n, float(self.start))
-
-    @property
-    def input_memory(self) -> int:
-        return self.reach
-
-    @property
-    def refuse(self) -> Any:
-        return refuse_lag
 
     @property
     def reach(self) -> int:
@@ -212,4 +204,4 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
             moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
             s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]
 
-    return ModelSteps(regress, push)
+    return ModelSteps(regress, push, ages=reach, refuse=refuse_lag)

@@ -12,7 +12,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import input_names, numbers, whole
-from driftfit.models.base import Model
+from driftfit.models.base import Linearised, Model
 
 TAIL, DEVIATIONS = 0.02, 2.0
 """An input is far from 0 if all but the share `TAIL` of its values are, by `DEVIATIONS` times their usual deviation
@@ -118,7 +118,7 @@ class CountedInputs(Model):
         return value if isinstance(value, tuple) else (value,) * self.m
 
 
-class LinearisedTransfer(CountedInputs):
+class LinearisedTransfer(CountedInputs, Linearised):
     """A transfer function whose regressors depend on theta; ``point`` holds them at one theta."""
 
     point: tuple[float, ...] | None
@@ -131,6 +131,10 @@ class LinearisedTransfer(CountedInputs):
         self._set("point", numbers(kind, "point", self.point, ndim=1))
         if self._given is not None and np.size(self.point) != self.n:
             raise ValueError(f"{kind}: point must have {self.n} entries, {', '.join(self.names)}; got {self.point!r}.")
+
+    @property
+    def linearised(self) -> Linearised:
+        return self
 
     @property
     def simulated(self) -> tuple[bool, ...]:

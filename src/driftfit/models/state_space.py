@@ -146,14 +146,6 @@ class StateSpace(NamedInputs):
         given = dict(self.start)
         return np.array([given.get(name, float(name not in self.hidden)) for name in self.names])
 
-    @property
-    def input_memory(self) -> int:
-        return self.system.reach
-
-    @property
-    def refuse(self) -> Any:
-        return forget_input
-
     def memory(self) -> Mapping[str, Any]:
         depth, n = self.system.reach + 1, self.n
         return {
@@ -240,7 +232,7 @@ def equations_of(text: str, inputs: tuple[str, ...]) -> Equations:
 
 @kernel
 def forget_input(s: State, signal: int, age: int, l: int) -> None:
-    """`Model.refuse`."""
+    """`ModelSteps.refuse`."""
     s.u_known[signal, age, l] = 0.0
 
 
@@ -284,4 +276,4 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
         s.without[l] = 0.0 if observed else s.without[l] + 1.0
         s.y_lag[0, l] = s.y[l] if observed else (s.y_hat[l] if known else np.nan)
 
-    return ModelSteps(regress, push)
+    return ModelSteps(regress, push, ages=reach, refuse=forget_input)

@@ -141,8 +141,9 @@ class Outputs(KeyedResults, OfRecord):
         if alone is None:
             found, names = self._collected, self.names[j]
             alone, known = Program(Regression(names), self.trackers[j]), known.changed(interval=found["dt"][:, j])
-            held = zip(names, self.model.sources, strict=True)
-            units |= {name: units[source] for name, source in held if source in units}
+            sources = {"y": self.outputs, "u": self.labels.u, "1": ("",)}
+            for name, (what, k, _) in zip(names, self.model.terms or (), strict=False):
+                units |= {name: units[sources[what][k]]} if sources[what][k] in units else {}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self._programs[j].gate is not None:
                 left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self._programs[j].signals)

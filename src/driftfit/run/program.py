@@ -102,8 +102,8 @@ class Program:
 
     @cached_property
     def settling(self) -> float:
-        """`Model.settling` of the whole model."""
-        return self.whole.settling
+        """`Linearised.settling` of the whole model, or 0."""
+        return 0.0 if self.whole.linearised is None else self.whole.linearised.settling
 
     @cached_property
     def inspects(self) -> bool:
@@ -137,7 +137,7 @@ class Program:
         if self.output is None:
             return self.tracker_start
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory_for(self.steps), **self.tracker_start}
+        return {**own.fitted_to(self.steps)[0], **self.tracker_start}
 
     @cached_property
     def tracker_start(self) -> State:
@@ -225,11 +225,12 @@ class Program:
         found = self._drivers.get((keep, steps))
         if found is None:
             model, own, gate = self.model, self.steps if steps is None else steps, None
+            given = model.fitted_to(self.steps)[1]
             if self.gate is not None:
-                ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                foresee = None if self.tracker.output_error else foreseeing(model.steps_for(self.steps), own)
-                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, foresee)
-            found = drivers(model.steps_for(self.steps), own, keep, gate)
+                implicit, lends = model.implicit is not None, not self.tracker.covariance
+                foresee = None if self.tracker.output_error else foreseeing(given, own)
+                gate = gate_step(self.gate, model.n, model.m, given.ages, given.refuse, implicit, lends, foresee)
+            found = drivers(given, own, keep, gate)
             if gate is not None:
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
@@ -273,7 +274,11 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else min(self.model.width, self.tracker.width)
+        return (
+            1
+            if self.model.n > WIDEST_LANES or self.gate is not None
+            else min(self.model.steps.width, self.tracker.width)
+        )
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -398,7 +403,7 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
 def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
-    memory = model.memory_for(programs[0].steps)
+    memory, _ = model.fitted_to(programs[0].steps)
     tracker = programs[0].tracker
     if both := sorted((set(memory) & set(programs[0].tracker_start)) - set(tracker.replaces)):
         raise ValueError(

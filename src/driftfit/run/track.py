@@ -275,7 +275,7 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
     for run in runs:
         for name, values in {} if run.program.gate else _codes(run).items():
             found[name] += values
-            linear &= run.model.hidden is None and not (run.model.implicit or run.model.settling)
+            linear &= run.model.hidden is None and not (run.model.implicit or run.program.settling)
     if found:
         warn(f"{verb}: {ungated(found, linear)}")
 
@@ -293,7 +293,7 @@ def _codes(run: Track) -> dict[str, list[float]]:
     found = {run.labels.y: y[entered & ~_begins_change(y, reason) & (run.ok | np.isnan(run.prediction))]}
     labels = run.labels.u or run.program.signals[1:]
     for name, label, signal, mark in zip(run.program.signals[1:], labels, u.T, strange[1:], strict=True):
-        blamed = left.sample[left.signal == name][:, None] - np.arange(run.program.model.input_memory + 1)
+        blamed = left.sample[left.signal == name][:, None] - np.arange(run.program.model.steps.ages + 1)
         found[label] = signal[np.intersect1d(blamed, np.flatnonzero(mark))]
     return {name: values.tolist() for name, values in found.items() if len(values)}
 

@@ -215,6 +215,11 @@ def steps(refined: bool) -> TrackerSteps:
     )
 
 
+def _written_by(model: Model) -> bool:
+    """Whether the model has instruments of its own."""
+    return model.linearised is not None and model.linearised.instruments
+
+
 @dataclass(frozen=True)
 class InstrumentalVariables(Forgetting):
     """Recursive instrumental variables for models in coloured noise, with an auxiliary model and forgetting.
@@ -267,7 +272,7 @@ class InstrumentalVariables(Forgetting):
         return steps(False)
 
     def steps_for(self, model: Model) -> TrackerSteps:
-        if model.instruments:
+        if _written_by(model):
             return steps(True)
         if model.output_lags is None:
             raise ValueError(
@@ -278,7 +283,7 @@ class InstrumentalVariables(Forgetting):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         own = {**super().state_for(model), "output_lags": model.output_lags or 0}
-        if self.p0 is None and model.output_lags and not model.instruments:
+        if self.p0 is None and model.output_lags and not _written_by(model):
             own |= {"discounted": FORGOTTEN * model.n, "first_memory": LEAST_SQUARES * model.n}
         return own
 

@@ -13,7 +13,7 @@ forgetting would let P grow without bound. It stops when a variance is ``c_max``
 regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
-`Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
+`Linearised.settling` the memory is at most `settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
 Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P is in units of the least variance of e so
 far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would outweigh all later
 ones. The least of many estimates is too small for a noise variance, which is instead the mean of e^2 / s over the last
@@ -78,8 +78,11 @@ def no_settling() -> dict[str, Any]:
 
 def settling_of(model: Model) -> dict[str, Any]:
     """Those that a model gives."""
-    N = model.settling
-    return {"discounted": N, "first_memory": model.settling_memory, "unequal": N if model.unequal_start else 0.0}
+    one = model.linearised
+    if one is None:
+        return {}
+    N = one.settling
+    return {"discounted": N, "first_memory": one.settling_memory, "unequal": N if one.unequal_start else 0.0}
 
 
 @kernel

@@ -23,7 +23,8 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import State, Step, exp, kernel, log
-from driftfit.models.linearised import along, informed, restore, subtract
+from driftfit.models.lags import informed, take_input
+from driftfit.models.linearised import along, restore, subtract
 
 TERMS = 16
 """Terms of the Taylor series after the first."""
@@ -216,8 +217,8 @@ def _signals(o: Orders) -> tuple[Any, Any, Any]:
 
 
 @lru_cache
-def _inputs(o: Orders) -> tuple[Any, Step]:
-    """``drive(s, l)`` moves the chains of the inputs, and says whether all of them were known; ``take_inputs``."""
+def _inputs(o: Orders) -> Any:
+    """``drive(s, l)`` moves the chains of the inputs, and says whether all of them were known."""
     n, m, delay, offset = o.n, o.m, o.delay, o.offset
     advance = chain_of(2 * n)
 
@@ -240,17 +241,12 @@ def _inputs(o: Orders) -> tuple[Any, Step]:
             complete = complete & known
         return complete
 
-    @kernel
-    def take_inputs(s: State, l: int) -> None:
-        for j in range(m):
-            s.u_lag[j, 0, l] = s.u[j, l]
-
-    return drive, take_inputs
+    return drive
 
 
 @lru_cache
-def refusing(o: Orders) -> Any:
-    """`Model.refuse`: an input that the chain has taken in at this sample is replaced by the one held before it."""
+def _refusing(o: Orders) -> Any:
+    """`ModelSteps.refuse`: the input held before takes the place of one that the chain has taken in at this sample."""
     n, delay, advance = o.n, o.delay, chain_of(2 * o.n)
 
     @kernel
@@ -264,13 +260,6 @@ def refusing(o: Orders) -> Any:
             advance(s, signal, 0, s.last[signal, l], 0.0, l)
 
     return refuse
-
-
-@lru_cache
-def late_inputs(o: Orders) -> Step:
-    """The step that takes the inputs of a sample after it."""
-    step: Step = _inputs(o)[1]
-    return step
 
 
 @lru_cache
@@ -336,7 +325,7 @@ def steps(o: Orders) -> ModelSteps:
     n, m, delay, parameters, offset, held, instruments = (
         o.n, o.m, o.delay, o.parameters, o.offset, o.held, o.instruments
     )  # fmt: skip
-    (drive, take_inputs), (follow, measure), (_, _, response) = _inputs(o), _outputs(o), _signals(o)
+    drive, (follow, measure), (_, _, response) = _inputs(o), _outputs(o), _signals(o)
     regressors = _regressors(o)
 
     @kernel
@@ -354,7 +343,7 @@ def steps(o: Orders) -> ModelSteps:
         for j in range(m):
             for i in range(delay, 0, -1):
                 s.u_lag[j, i, l] = s.u_lag[j, i - 1, l]
-        take_inputs(s, l)
+        take_input(s, l)
         known = complete & (s.begun[l] > 0.0) & (abs(y_hat) < LARGEST)
         shift = y_hat - along(s, l)
         if instruments:
@@ -379,4 +368,4 @@ def steps(o: Orders) -> ModelSteps:
             s.chain[m, i, l] = moved if abs(moved) < LARGEST else 0.0
         s.last_y[l] = y
 
-    return ModelSteps(regress, push)
+    return ModelSteps(regress, push, apply=take_input, ages=delay + 1, refuse=_refusing(o))

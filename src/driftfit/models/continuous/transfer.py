@@ -41,9 +41,9 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
-from driftfit.engine.kernel import Array, Step
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
-from driftfit.models.continuous.filters import STIFF, Orders, late_inputs, refusing, steps
+from driftfit.models.continuous.filters import STIFF, Orders, steps
 from driftfit.models.continuous.sampling import sampled
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
@@ -175,23 +175,11 @@ class ContinuousTransfer(LinearisedTransfer):
         }  # fmt: skip
 
     @property
-    def input_memory(self) -> int:
-        return self.delay + 1
-
-    @property
-    def refuse(self) -> Any:
-        return refusing(self._orders(False))
-
-    @property
     def steps(self) -> ModelSteps:
         return steps(self._orders(False))
 
-    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
-        return steps(self._orders(tracker.instruments))
-
-    @property
-    def apply(self) -> Step | None:
-        return late_inputs(self._orders(False))
+    def fitted_to(self, tracker: TrackerSteps) -> tuple[Mapping[str, Any], ModelSteps]:
+        return self.memory(), steps(self._orders(tracker.instruments))
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """As every model in powers of z^-1: those of the system sampled at nominal times."""

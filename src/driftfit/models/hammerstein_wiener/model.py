@@ -43,12 +43,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, Step
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, output_names, warn, whole
-from driftfit.models.base import Model
+from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.forward import play
-from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, refusing
+from driftfit.models.hammerstein_wiener.steps import DIGITS, build
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
 from driftfit.models.inputs import CountedInputs
@@ -81,7 +81,7 @@ def _plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class HammersteinWiener(CountedInputs):
+class HammersteinWiener(CountedInputs, Implicit):
     """Hammerstein-Wiener model.
 
     Parameters
@@ -176,10 +176,6 @@ class HammersteinWiener(CountedInputs):
         return super().from_settings(settings | bases)
 
     @property
-    def width(self) -> int:
-        return 1
-
-    @property
     def bases(self) -> tuple[Basis, ...]:
         """Functions of the curve of each input."""
         return tuple(IDENTITY if basis is None else basis for basis in self.for_each_input("input"))
@@ -246,14 +242,6 @@ class HammersteinWiener(CountedInputs):
         return {"blocks": _memory(self).copy()}
 
     @property
-    def input_memory(self) -> int:
-        return max(count + delay for count, delay in zip(self.structure.nb, self.delays, strict=True)) - 1
-
-    @property
-    def refuse(self) -> Any:
-        return refusing(self.places)
-
-    @property
     def places(self) -> tuple[int, ...]:
         """The positions of all numbers in the memory of the steps."""
         return _places(self)
@@ -261,10 +249,6 @@ class HammersteinWiener(CountedInputs):
     @property
     def steps(self) -> ModelSteps:
         return _steps(self)
-
-    @property
-    def apply(self) -> Step | None:
-        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
 
     @property
     def reach(self) -> int:
@@ -281,8 +265,8 @@ class HammersteinWiener(CountedInputs):
         return range(t + min(self.delays), t + max(ends))
 
     @property
-    def implicit(self) -> bool:
-        return True
+    def implicit(self) -> Implicit:
+        return self
 
     def expand(self, theta: Array) -> Array | None:
         return self.structure.products(theta) if theta.shape[-1] == self.structure.n_x else None
@@ -304,17 +288,6 @@ class HammersteinWiener(CountedInputs):
         found: Array = np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1)
         return found
 
-    def log_jacobian(self, theta: Array, y: Array) -> Array:
-        """log max(F'(y_t; d_t), f) with the estimate after the sample, the factor that converts the density of z into
-        that of y; f is 1e-3 of the slope of the functions.
-
-        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
-        y integrates to 1 with the estimate after the sample, and to more with the one before.
-        """
-        with np.errstate(invalid="ignore"):
-            found: Array = np.log(np.maximum(self.slope(theta, y), _flattest(self)))
-        return found
-
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of w to one equation error: that of 1 / A(z)."""
         response: Array = np.eye(1, h)[0]
@@ -324,8 +297,13 @@ class HammersteinWiener(CountedInputs):
         return response
 
     def output_slope(self, theta: Array, y: Array) -> Array:
-        """F'(y), at least 1e-3 of the slope of the functions: an equation error moves y by its reciprocal."""
-        found: Array = np.maximum(self.slope(theta, y), _flattest(self))
+        """F'(y_t; d_t) with the estimate after the sample, at least 1e-3 of the slope of the functions.
+
+        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
+        y integrates to 1 with the estimate after the sample, and to more with the one before.
+        """
+        with np.errstate(invalid="ignore"):
+            found: Array = np.maximum(self.slope(theta, y), _flattest(self))
         return found
 
     def noise_factor(self, theta: Array, y: Array) -> float:

@@ -14,7 +14,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, SMALLEST, ModelSteps
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.models.base import GAP
-from driftfit.models.linearised import along, informed, restore, subtract
+from driftfit.models.lags import informed
+from driftfit.models.linearised import along, restore, subtract
 
 SETTLING = 4.0
 """Samples for each parameter, at the start, that are a pseudolinear regression."""
