@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, exp, kernel, log
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.engine.settings import numbers
 
 FORMULA_LENGTH = 20000
@@ -215,7 +215,7 @@ class Writer:
 
     def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
         if name == self.formula.output:
-            return self.let(f"s.y_lag[{lag}, l]"), {}
+            return self.let(f"s.y_lag[0, {lag}, l]"), {}
         return self.let(f"s.u_lag[{self.inputs.index(name)}, {lag}, l]"), {}
 
     def _scaled(self, factor: str, x: str, dx: dict[int, str]) -> tuple[str, dict[int, str]]:
@@ -305,6 +305,28 @@ def start_values(model: str, given: Any, names: Sequence[str]) -> Any:
     if unknown := sorted(set(found) - set(names)):
         raise ValueError(f"{model}: start names {', '.join(unknown)}; there are {', '.join(names)}.")
     return tuple((name, numbers(model, "start", value, ndim=0)) for name, value in found.items())
+
+
+def complete_with(known: Any, lines: Sequence[Formula], inputs: tuple[str, ...], output: str) -> Any:
+    """``complete(s, l)``: whether the lags of the output and the inputs that the lines use are known; tanh, min or a
+    condition has a value without them. ``known(s, j, lag, l)`` says it of an input.
+    """
+    lags = {pair for line in lines for pair in line.lags}
+    used = sorted((inputs.index(name), lag) for name, lag in lags if name in inputs)
+    own = tuple(sorted(lag for name, lag in lags if name == output))
+    of_input, with_lag, at = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,), own or (0,)
+    count, owned = len(used), len(own)
+
+    @kernel
+    def complete(s: State, l: int) -> bool:
+        found = True
+        for k in range(count):
+            found = found & known(s, of_input[k], with_lag[k], l)
+        for k in range(owned):
+            found = found & (abs(s.y_lag[0, at[k], l]) < LARGEST)
+        return found
+
+    return complete
 
 
 @lru_cache(maxsize=256)

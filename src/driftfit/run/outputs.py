@@ -141,9 +141,10 @@ class Outputs(KeyedResults, OfRecord):
         if alone is None:
             found, names = self._collected, self.names[j]
             alone, known = Program(Regression(names), self.trackers[j]), known.changed(interval=found["dt"][:, j])
-            sources = {"y": self.outputs, "u": self.labels.u, "1": ("",)}
-            for name, (what, k, _) in zip(names, self.model.terms or (), strict=False):
-                units |= {name: units[sources[what][k]]} if sources[what][k] in units else {}
+            signals = {("y", k): name for k, name in enumerate(self.outputs)}
+            signals |= {("u", k): name for k, name in enumerate(self.labels.u)}
+            held = [(name, signals.get(term[:2])) for name, term in zip(names, self.model.terms or (), strict=False)]
+            units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self._programs[j].gate is not None:
                 left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self._programs[j].signals)

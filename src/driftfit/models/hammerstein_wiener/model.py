@@ -37,8 +37,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, ClassVar, Self
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -170,11 +170,6 @@ class HammersteinWiener(CountedInputs, Implicit):
     def settings(self) -> dict[str, Any]:
         return {name: _plain(value) for name, value in super().settings().items()}
 
-    @classmethod
-    def from_settings(cls, settings: dict[str, Any]) -> Self:
-        bases = {"input": _blocks(settings.get("input")), "output": _blocks(settings.get("output"))}
-        return super().from_settings(settings | bases)
-
     @property
     def bases(self) -> tuple[Basis, ...]:
         """Functions of the curve of each input."""
@@ -228,10 +223,10 @@ class HammersteinWiener(CountedInputs, Implicit):
             names = [each.replace(f"[u{i + 1}]", f"[{name}]") for each in names]
         return tuple(names)
 
-    @property
+    @cached_property
     def rise(self) -> Array:
         """r with r'c > 0 for the curves that rise, of each input (sum of n_in,); 0 where c_1 = 1 by definition."""
-        return _rise(self)
+        return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in self.bases])
 
     @property
     def linear(self) -> bool:
@@ -239,16 +234,17 @@ class HammersteinWiener(CountedInputs, Implicit):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return {"blocks": _memory(self).copy()}
+        sigma = self.output_noise[0] if several(self.output_noise) else self.output_noise
+        return {"blocks": memory(self.structure, self.delays, self.bases, self.out, sigma or 0.0, self._least_noise)}
 
-    @property
+    @cached_property
     def places(self) -> tuple[int, ...]:
         """The positions of all numbers in the memory of the steps."""
-        return _places(self)
+        return places_of(self.structure, self.delays, self.bases, self.out)
 
     @property
     def steps(self) -> ModelSteps:
-        return _steps(self)
+        return build(tuple(basis.kind for basis in self.bases), self.out.kind, self.places)
 
     @property
     def reach(self) -> int:
@@ -303,7 +299,7 @@ class HammersteinWiener(CountedInputs, Implicit):
         y integrates to 1 with the estimate after the sample, and to more with the one before.
         """
         with np.errstate(invalid="ignore"):
-            found: Array = np.maximum(self.slope(theta, y), _flattest(self))
+            found: Array = np.maximum(self.slope(theta, y), SLOPE_SHARE * self.out.steepness)
         return found
 
     def noise_factor(self, theta: Array, y: Array) -> float:
@@ -311,7 +307,12 @@ class HammersteinWiener(CountedInputs, Implicit):
         if self.output_noise is None:
             return 1.0
         energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
-        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + _least_noise(self))
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + self._least_noise)
+
+    @property
+    def _least_noise(self) -> float:
+        """The slope of the identity is 1, so that it needs no floor."""
+        return 0.0 if self.linear else VARIANCE_SHARE * self.out.height**2
 
     def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
         if not any(basis.adaptive for basis in self.bases):
@@ -353,35 +354,3 @@ class HammersteinWiener(CountedInputs, Implicit):
                     f"{values.max():g})).",
                     UserWarning,
                 )
-
-
-@lru_cache
-def _flattest(model: HammersteinWiener) -> float:
-    return SLOPE_SHARE * model.out.steepness
-
-
-@lru_cache
-def _least_noise(model: HammersteinWiener) -> float:
-    """The slope of the identity is 1, so that it needs no floor."""
-    return 0.0 if model.linear else VARIANCE_SHARE * model.out.height**2
-
-
-@lru_cache
-def _places(model: HammersteinWiener) -> tuple[int, ...]:
-    return places_of(model.structure, model.delays, model.bases, model.out)
-
-
-@lru_cache
-def _memory(model: HammersteinWiener) -> Array:
-    sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
-    return memory(model.structure, model.delays, model.bases, model.out, sigma or 0.0, _least_noise(model))
-
-
-@lru_cache
-def _rise(model: HammersteinWiener) -> Array:
-    return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in model.bases])
-
-
-@lru_cache
-def _steps(model: HammersteinWiener) -> ModelSteps:
-    return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)

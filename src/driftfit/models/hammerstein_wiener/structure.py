@@ -39,6 +39,16 @@ from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 
 
+class Spans(NamedTuple):
+    """The positions of a, b of each input, c of each input, d and the intercept among coefficients."""
+
+    a: Array
+    b: list[Array]
+    c: list[Array]
+    d: Array
+    rest: Array
+
+
 class Structure(NamedTuple):
     """Orders of a Hammerstein-Wiener model; ``nb`` and ``n_in`` have an entry for each input."""
 
@@ -145,11 +155,12 @@ class Structure(NamedTuple):
         J[..., products, second] = x[..., first]
         return J
 
-    def spans(self, free: bool) -> list[Array]:
-        """The positions of a, b of each input, c of each input, d_2 .. and l in xi, or in zeta if c_1 is ``free``."""
-        c = [n_in - 1 + free for n_in in self.n_in]
-        ends = np.cumsum([0, self.na, *self.nb, *c, self.n_out - 1, self.intercept])
-        return [np.arange(first, last) for first, last in pairwise(ends)]
+    def spans(self, free: bool, lead: bool = False) -> Spans:
+        """Their positions in xi; in zeta if c_1 is ``free``, and among all coefficients if d_1 is one of them too."""
+        m, c = len(self.nb), [n_in - 1 + free for n_in in self.n_in]
+        ends = np.cumsum([0, self.na, *self.nb, *c, self.n_out - 1 + lead, self.intercept])
+        a, *both, d, rest = (np.arange(first, last) for first, last in pairwise(ends))
+        return Spans(a, both[:m], both[m:], d, rest)
 
 
 @lru_cache
@@ -157,8 +168,7 @@ def positions(s: Structure, free: bool) -> tuple[Array, Array]:
     """(entry of theta, entry of xi) of the parameters that appear in theta alone, (2, k), and (entry of theta, entry of
     xi, entry of xi) of the products b c and a d, (3, k); for zeta in the place of xi if c_1 is ``free``.
     """
-    spans, (at_d, row, at_ad), m = s.spans(free), s.starts, len(s.nb)
-    a, bs, cs, d, rest = spans[0], spans[1 : 1 + m], spans[1 + m : -2], spans[-2], spans[-1]
+    (a, bs, cs, d, rest), (at_d, row, at_ad) = s.spans(free), s.starts
     alone = [(i, i) for i in (a if free else range(at_d))]
     alone += [(at_d + k, x) for k, x in enumerate(d)] + [(s.n - 1, x) for x in rest]
     pairs = [(j, j, c[0]) for b, c in zip(bs, cs, strict=True) for j in (b if free else ())]
