@@ -33,6 +33,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.base import GAP
-from driftfit.models.formula import Formula, compiled, complete_with, parse, start_values
+from driftfit.models.formula import Formula, compiled, complete_with, in_numpy, parse, start_values
 from driftfit.models.inputs import NamedInputs
 from driftfit.models.lags import informed, refuse_lag, shift_inputs
 from driftfit.models.linearised import MEMORY, along, restore, subtract
@@ -114,13 +115,13 @@ class Equation(NamedInputs):
         return _steps(self.equation, self.input_names)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
-        p, h = y.shape[1], noise.shape[1]
-        out = np.concatenate([y, np.zeros((len(theta), h))], axis=1)
+        p, h, value = y.shape[1], noise.shape[1], in_numpy(self.equation, self.input_names)
+        out, s = np.concatenate([y, np.zeros((len(theta), h))], axis=1), SimpleNamespace(point=theta.T)
         for k in range(h):
-            t = p + k
-            signals = {name: u[:, : t + 1, j] for j, name in enumerate(self.input_names)}
-            signals[self.formula.output] = out[:, : t + 1]
-            out[:, t] = self.formula.value(theta.T, signals) + noise[:, k]
+            recent = slice(p + k - self.reach, p + k + 1)
+            s.y_lag, s.u_lag = out.T[None, recent][:, ::-1], u.T[:, recent][:, ::-1]
+            with np.errstate(all="ignore"):
+                out[:, p + k] = value(s, slice(None)) + noise[:, k]
         return out[:, p:]
 
 

@@ -51,13 +51,11 @@ from driftfit.trackers.forms.covariance import forecast
 from driftfit.trackers.forms.diffuse import (
     SCRATCH,
     absorb_on_roots,
+    before_any_sample,
     correct_on_roots,
     forecast_on_roots,
     hand_over,
-    knowing,
-    knowing_nothing,
     reform,
-    spanned_variance,
     started,
     wander,
 )
@@ -254,13 +252,12 @@ def correct_direction_root_form(s: State, l: int) -> None:
     hand_over(s, l)
 
 
-EXPONENTIAL = started(
-    TrackerSteps(forget, forecast, correct, learns_scale=True),
-    TrackerSteps(forget_root_form, forecast_on_roots, correct_root_form, spanned_variance),
-)
+EXPONENTIAL = started(TrackerSteps(forget, forecast, correct, learns_scale=True), forget_root_form, correct_root_form)
 DIRECTIONAL = started(
     TrackerSteps(nothing, forecast, correct_direction, learns_scale=True),
-    TrackerSteps(nothing, forecast_direction, correct_direction_root_form, spanned_variance),
+    nothing,
+    correct_direction_root_form,
+    forecast_direction,
 )
 
 
@@ -303,7 +300,7 @@ class Forgetting(Tracker):
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_settling(),
             **no_scale(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **before_any_sample(n, self.p0),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:

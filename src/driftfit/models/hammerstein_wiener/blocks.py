@@ -162,8 +162,8 @@ class Blocks:
         """The blocks with other coefficients."""
         if gauged[0] == "b1":
             x[:, [b[0] for b in spans.b]] = 1.0
-        b, c = (x[:, np.concatenate(part)] for part in (spans.b, spans.c))
-        d, intercept = x[:, spans.d], x[:, -1] if len(spans.rest) else None
+        _, b, c, d, rest = np.split(x, [spans.b[0][0], spans.c[0][0], spans.d[0], spans.d[-1] + 1], axis=1)
+        intercept = rest[:, 0] if rest.size else None
         std = Groups(self.std.a, *(np.full(part.shape, np.nan) for part in (b, c, d)))
         if cov is not None:
             std = deviations(self.model, np.einsum("tii->ti", cov))
@@ -239,18 +239,11 @@ def radius_of(a: Array) -> Array:
     return found
 
 
-class Separator:
-    """Separates one theta after another, for streams."""
-
-    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        """``names`` of the parameters: those of the model, or of the minimal ones."""
-        if not isinstance(model, HammersteinWiener):
-            raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
-        self.model, self._minimal = model, names != model.names
-
-    def __call__(self, theta: Array, method: str) -> Groups:
-        """a, b, c, d from one theta (n,), or from minimal parameters."""
-        if self._minimal:
-            return Groups(*self.model.structure.groups(theta))
-        one_of("blocks", "method", method, METHODS[:3])
-        return Groups(*(group[0] for group in split(self.model, theta[None], method)[:4]))
+def separated(model: Model, names: tuple[str, ...], theta: Array, method: str) -> Groups:
+    """a, b, c, d from one theta (n,) of these names: those of the model, or of its minimal parameters."""
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
+    if names != model.names:
+        return Groups(*model.structure.groups(theta))
+    one_of("blocks", "method", method, METHODS[:3])
+    return Groups(*(group[0] for group in split(model, theta[None], method)[:4]))

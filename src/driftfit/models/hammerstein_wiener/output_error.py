@@ -107,11 +107,9 @@ def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> flo
 
 
 @shared
-def advance(
-    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
-) -> None:
+def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, scratch: Array, q_w: float, reach: float) -> None:
     """The time update of w, which is held within reach whatever the poles do, and of S."""
-    n_w, N = len(w), len(S)
+    n_w, N, row, moved = len(w), len(S), scratch[0], scratch[1]
     total = transition(p, theta, phi, w, row)
     for x in range(n_w + p[AT.x_d] + p[AT.n_out] - 1, N):
         row[x] = -1.0
@@ -132,17 +130,18 @@ def advance(
 
 
 @shared
-def absorb(k: Array, e: float, theta: Array, w: Array, S: Array, moved: Array) -> None:
-    """The measurement update with the gain k (N,) = moved / s, where ``moved`` = S h of the forecast."""
+def absorb(e: float, s: float, theta: Array, w: Array, S: Array, moved: Array) -> None:
+    """The measurement update for an innovation e of variance s, with ``moved`` = S h of the forecast."""
     n_w = len(w)
     for x in range(len(S)):
+        k = moved[x] / s
         if x < n_w:
-            w[x] += k[x] * e
+            w[x] += k * e
         else:
-            theta[x - n_w] += k[x] * e
+            theta[x - n_w] += k * e
         for z in range(x):
-            S[x, z] -= k[x] * moved[z]
-        S[x, x] = max(S[x, x] - k[x] * moved[x], LEFT * S[x, x])
+            S[x, z] -= k * moved[z]
+        S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
 
 
 @shared
@@ -187,62 +186,84 @@ def reach_of(m: Array, p: Places) -> float:
 
 
 @lru_cache
-def _steps(out: Kind, p: tuple[int, ...]) -> TrackerSteps:
+def _following(p: tuple[int, ...]) -> Step:
+    """`follow_power` of a state."""
+    orders, rows = np.array(p), room(p)
+
+    @kernel
+    def follow(s: State, l: int) -> None:
+        n, m = s.theta.shape[0], s.v_power.shape[0]
+        theta, v_power = floats(s.theta.ctypes.data, 1, n)[0], floats(s.v_power.ctypes.data, 1, m)[0]
+        follow_power(floats(s.blocks.ctypes.data, rows, 1), orders, theta, v_power)
+
+    return follow  # type: ignore[no-any-return]
+
+
+@lru_cache
+def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
     """The steps for the functions of an output basis and the places of a model."""
     orders, rows, n_w, curved = np.array(p), room(p), max(p[AT.na], 1), not p[AT.identity]
     n_out, d, free, g, h = p[AT.n_out], p[AT.d_now], p[AT.x_d], p[AT.trial], p[AT.trial_bend]
+    n_x, n, m_u = free + n_out - 1 + intercept, p[AT.n], p[AT.inputs]
+    N, follow = n_w + n_x, _following(p)
     fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), shared(inverse_of(out).py_func)
 
     @kernel
-    def advance_states(s: State, m: Array, l: int) -> float:
-        theta, w, S = s.theta[:, l], s.w[:, l], s.S[:, :, l]
-        for i in range(s.theta.shape[0]):
+    def advance_states(s: State, m: Array, S: Array, scratch: Array, l: int) -> float:
+        theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
+        phi, v_power = floats(s.phi.ctypes.data, 1, n)[0], floats(s.v_power.ctypes.data, 1, m_u)[0]
+        for i in range(n_x):
             for j in range(i + 1):
                 S[n_w + i, n_w + j] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
         for k in range(n_out - 1):
             m[d + k + 1, 0] = theta[free + k]
-        if (s.begun[l] == 0.0) & (m[NUMBER.started, 0] > 0.0):
+        if s.begun[l] == 0.0 and m[NUMBER.started, 0] > 0.0:
             past_levels(m, orders, w, S, s.p_w[l])
             s.begun[l] = 1.0
-        power = unknown_power(m, orders, theta, s.v_power[:, l])
-        reach = reach_of(m, orders)
-        advance(orders, theta, s.phi[:, l], w, S, s.row[:, l], s.moved[:, l], s.q_w[l] + power, reach)
+        power = unknown_power(m, orders, theta, v_power)
+        advance(orders, theta, phi, w, S, scratch, s.q_w[l] + power, reach_of(m, orders))
         return power  # type: ignore[no-any-return]
 
     @kernel
     def forecast(s: State, l: int) -> None:
-        m = floats(s.blocks.ctypes.data, rows, 1)
-        power = advance_states(s, m, l)
-        y_hat, y = (invert(m, orders, s.w[0, l]) if curved else s.w[0, l]), m[NUMBER.raw, 0]
+        m, S, scratch = (
+            floats(s.blocks.ctypes.data, rows, 1),
+            floats(s.S.ctypes.data, N, N),
+            floats(s.scratch.ctypes.data, 2, N),
+        )
+        power = advance_states(s, m, S, scratch, l)
+        y_hat, y = s.w[0, l], m[NUMBER.raw, 0]
+        if curved:
+            y_hat = invert(m, orders, y_hat)
         able = abs(y_hat) < np.inf
         fill_trial(m, orders, y_hat if able else 0.0, g, h)
         slope = 0.0
         for k in range(n_out):
             slope += m[d + k, 0] * m[h + k, 0]
         slope, given = max(slope, s.least_slope[l]), m[NUMBER.given, 0]
-        valid, observed = (power == 0.0) & able & (s.begun[l] > 0.0), abs(y) < np.inf
-        used = valid & observed & (given < np.inf)
+        valid, observed = power == 0.0 and able and s.begun[l] > 0.0, abs(y) < np.inf
+        used = valid and observed and given < np.inf
         s.valid[l], s.observed[l] = 1.0 if valid else 0.0, 1.0 if observed else 0.0
         s.ok[l], s.e[l] = 1.0 if used else 0.0, y - y_hat if used else 0.0
-        for x in range(s.S.shape[0]):
-            s.row[x, l] = 0.0
-        s.row[0, l] = 1.0 / slope
+        for x in range(N):
+            scratch[0, x] = 0.0
+        scratch[0, 0] = 1.0 / slope
         for k in range(1, n_out):
-            s.row[n_w + free + k - 1, l] = -m[g + k, 0] / slope
-        s.h[l] = product(s.S[:, :, l], s.row[:, l], s.moved[:, l], 0.0)
+            scratch[0, n_w + free + k - 1] = -m[g + k, 0] / slope
+        s.h[l] = product(S, scratch[0], scratch[1], 0.0)
         m[NUMBER.predicted, 0], m[NUMBER.late, 0], s.y_hat[l] = y_hat, 0.0, y_hat
         s.noise[l] = given if given < np.inf else 1.0
 
     @kernel
     def correct(s: State, l: int) -> None:
+        theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
+        S, scratch = floats(s.S.ctypes.data, N, N), floats(s.scratch.ctypes.data, 2, N)
         if s.ok[l] > 0.0:
-            for x in range(s.S.shape[0]):
-                s.row[x, l] = s.moved[x, l] / s.s[l]
-            absorb(s.row[:, l], s.e[l], s.theta[:, l], s.w[:, l], s.S[:, :, l], s.moved[:, l])
-        follow_power(floats(s.blocks.ctypes.data, rows, 1), orders, s.theta[:, l], s.v_power[:, l])
-        for i in range(s.theta.shape[0]):
+            absorb(s.e[l], s.s[l], theta, w, S, scratch[1])
+        follow(s, l)
+        for i in range(n_x):
             for j in range(i + 1):
-                s.P[i, j, l] = s.S[n_w + i, n_w + j, l]
+                s.P[i, j, l] = S[n_w + i, n_w + j]
 
     return TrackerSteps(nothing, forecast, correct)
 
@@ -250,12 +271,12 @@ def _steps(out: Kind, p: tuple[int, ...]) -> TrackerSteps:
 @lru_cache
 def _applying(place: Step, p: tuple[int, ...]) -> Step:
     """The input also updates the usual power of v."""
-    orders, rows = np.array(p), room(p)
+    follow = _following(p)
 
     @kernel
     def apply(s: State, l: int) -> None:
         place(s, l)
-        follow_power(floats(s.blocks.ctypes.data, rows, 1), orders, s.theta[:, l], s.v_power[:, l])
+        follow(s, l)
 
     return apply  # type: ignore[no-any-return]
 
@@ -313,7 +334,7 @@ class OutputError(Minimal):
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {
             **self.state(structure.n_x), "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
-            "row": np.zeros(N), "moved": np.zeros(N), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0,
+            "scratch": np.zeros((2, N)), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0,
             "least_slope": SLOPE_SHARE * model.out.steepness, "v_power": np.zeros(model.m),
         }  # fmt: skip
 
@@ -322,7 +343,7 @@ class OutputError(Minimal):
         if len(model.outputs) > 1:
             raise ValueError("OutputError: follows one output at a time; track each output by itself.")
         assert isinstance(model, HammersteinWiener)
-        return _steps(model.out.kind, model.places)._replace(machines=(model.out.evaluate,))
+        return _steps(model.out.kind, model.places, model.intercept)._replace(machines=(model.out.evaluate,))
 
     def apply_for(self, model: Model) -> Step | None:
         assert isinstance(model, HammersteinWiener)
