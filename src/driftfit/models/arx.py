@@ -152,19 +152,10 @@ class ARX(CountedInputs):
         return {**self.memory(), **no_doubts(ny, self.na)}, doubting
 
     @property
-    def output_lags(self) -> int:
-        """The number of leading entries of phi that are past outputs: a bank of hypotheses corrects them by leaf."""
-        return self.na
-
-    @property
     def terms(self) -> tuple[Term, ...]:
         past: list[Term] = [("y", o, i + 1) for o in range(len(self.outputs)) for i in range(self.na)]
         given: list[Term] = [("u", j, nk + i) for j, (nb, nk) in enumerate(self.lags) for i in range(nb)]
         return (*past, *given, *([("1", 0, 0)] if self.intercept else []))
-
-    @property
-    def reach(self) -> int:
-        return max(self.na, *(nb + nk - 1 for nb, nk in self.lags), 0)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         if self.joint:

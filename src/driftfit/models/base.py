@@ -121,9 +121,10 @@ class Model(Settings, ABC):
     def output_lags(self) -> int | None:
         """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
 
-        None if past outputs are elsewhere, or are transformed; 0 where there are none.
+        None if past outputs are elsewhere, or are transformed; 0 where there are none. Of several outputs it is their
+        number for each.
         """
-        return None
+        return None if self.terms is None else sum(what == "y" and j == 0 for what, j, _ in self.terms)
 
     @property
     def terms(self) -> tuple[Term, ...] | None:
@@ -143,7 +144,7 @@ class Model(Settings, ABC):
     @property
     def reach(self) -> int:
         """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
-        return 0
+        return max((lag for _, _, lag in self.terms or ()), default=0)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.

@@ -268,34 +268,36 @@ class PolynomialModel(LinearisedTransfer):
         return response
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-        theta = np.asarray(theta, dtype=float)
-        p, one = self._places, np.ones((*theta.shape[:-1], 1))
-        A = whole = np.concatenate([one, -theta[..., : self.na]], axis=-1)
+        parts = self.parts(theta)
+        A = whole = parts["A"]
         found = []
-        for j, (nb, nf, nk) in enumerate(self.orders):
-            delay = np.zeros((*theta.shape[:-1], nk))
-            B = np.concatenate([delay, theta[..., p.at_b[j] : p.at_b[j] + nb]], axis=-1)
-            F = np.concatenate([one, -theta[..., p.at_f[j] : p.at_f[j] + nf]], axis=-1)
+        for B, F in zip(parts["B"], parts["F"], strict=True):
             whole = _product(whole, F)
             found.append((B, _product(A, F)))
         return whole, found
 
     def parts(self, theta: Array) -> dict[str, Any]:
-        """The polynomials of one theta (n,) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
+        """The polynomials of theta (.., n) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
 
         They have the signs of the equation, so that A = [1, -a_1, ..]; B begins with nk zeros.
         """
         theta = np.asarray(theta, dtype=float)
         sizes = [self.na, *(nb for nb, _, _ in self.orders), self.nc, self.nd, *(nf for _, nf, _ in self.orders)]
-        cut = np.split(theta[: sum(sizes)], np.cumsum(sizes)[:-1])
-        b, (c, d), f = cut[1 : 1 + self.m], cut[1 + self.m : 3 + self.m], cut[3 + self.m :]
+        a, *cut = np.split(theta[..., : sum(sizes)], np.cumsum(sizes)[:-1], axis=-1)
+        b, (c, d), f = cut[: self.m], cut[self.m : 2 + self.m], cut[2 + self.m :]
+        zeros = [np.zeros((*theta.shape[:-1], nk)) for _, _, nk in self.orders]
         return {
-            "A": np.append(1.0, -cut[0]),
-            "B": [np.append(np.zeros(nk), one) for one, (_, _, nk) in zip(b, self.orders, strict=True)],
-            "C": np.append(1.0, c),
-            "D": np.append(1.0, -d),
-            "F": [np.append(1.0, -one) for one in f],
+            "A": _monic(-a),
+            "B": [np.concatenate([late, one], axis=-1) for late, one in zip(zeros, b, strict=True)],
+            "C": _monic(c),
+            "D": _monic(-d),
+            "F": [_monic(-one) for one in f],
         }
+
+
+def _monic(rest: Array) -> Array:
+    """The polynomial 1 + rest_1 z^-1 + .., coefficients on the last axis."""
+    return np.concatenate([np.ones((*rest.shape[:-1], 1)), rest], axis=-1)
 
 
 def _product(one: Array, other: Array) -> Array:
