@@ -86,17 +86,17 @@ class Structure(NamedTuple):
         """The labels that distinguish the coefficients of several inputs in their names."""
         return tuple(f"[u{i + 1}]" for i in range(len(self.nb))) if len(self.nb) > 1 else ("",)
 
-    def lags(self, tag: int) -> list[str]:
-        """Names of the b of an input."""
-        return [f"b{j + 1}{self.tags[tag]}" for j in range(self.nb[tag])]
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of theta."""
-        a = [f"A{i + 1}" for i in range(self.na)]
-        b = [name for i in range(len(self.nb)) for name in self.lags(i)]
-        d = [f"d{k}" for k in range(2, self.n_out + 1)]
-        bc = [f"{name}*c{k}" for i, n_in in enumerate(self.n_in) for k in range(2, n_in + 1) for name in self.lags(i)]
+        a, b, _, (_, *d) = self.groups_names
+        lags = [b[end - nb : end] for nb, end in zip(self.nb, np.cumsum(self.nb).tolist(), strict=True)]
+        bc = [
+            f"{name}*c{k}"
+            for own, n_in in zip(lags, self.n_in, strict=True)
+            for k in range(2, n_in + 1)
+            for name in own
+        ]
         ad = [f"{name}*{last}" for last in d for name in a]
         return (*a, *b, *d, *bc, *ad, *(("intercept",) if self.intercept else ()))
 
@@ -105,7 +105,7 @@ class Structure(NamedTuple):
         """Names of a, b, c and d, the leading coefficients of the curves among them."""
         return (
             tuple(f"A{i + 1}" for i in range(self.na)),
-            tuple(name for i in range(len(self.nb)) for name in self.lags(i)),
+            tuple(f"b{j + 1}{tag}" for tag, nb in zip(self.tags, self.nb, strict=True) for j in range(nb)),
             tuple(f"c{k + 1}{tag}" for tag, n_in in zip(self.tags, self.n_in, strict=True) for k in range(n_in)),
             tuple(f"d{k + 1}" for k in range(self.n_out)),
         )
