@@ -1,12 +1,13 @@
 """Equations as text: what is refused, exact derivatives, linear equations as regressions, estimates, recovery."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Live, Regression, track
 from driftfit.models.base import Model
-from driftfit.models.formula import parse
 from driftfit.parsing.expressions import read
 from driftfit.smooth.problem import replay
 
@@ -28,15 +29,34 @@ def held(model, theta, y, u):
     return track(model, Kalman(q=0.0, r=1.0, p0=1e-20, theta0=tuple(theta)), y, u)
 
 
+class Signal(float):
+    """The present value of a signal, which knows those before it."""
+
+    def __new__(cls, values):
+        made = super().__new__(cls, values[-1])
+        made.values = values
+        return made
+
+    def __getitem__(self, lag):
+        return self.values[lag - 1]
+
+
 def test_derivatives_are_exact_and_the_value_is_that_of_numpy():
     y, u = data()
     model = Equation(EVERYTHING, start=dict(zip("abc", THETA, strict=True)))
     run, step = held(model, THETA, y, u), 1e-6
     phi = replay(run)["phi"][..., 0]
     for t in range(10, 120):
-        signals = {"u": u[None, : t + 1, 0], "v": u[None, : t + 1, 1], "y": y[None, : t + 1]}
-        around = np.array(THETA)[:, None] + step * np.c_[np.zeros(3), np.eye(3), -np.eye(3)]
-        value = parse(EVERYTHING).value(around, signals)
+        signals = {"u": Signal(u[: t + 1, 0]), "v": Signal(u[: t + 1, 1]), "y": Signal(y[: t + 1])}
+        around = np.array(THETA) + step * np.r_[np.zeros((1, 3)), np.eye(3), -np.eye(3)]
+        names = [
+            vars(np)
+            | {"max": max, "min": min}
+            | signals
+            | {"theta": SimpleNamespace(**dict(zip("abc", at, strict=True)))}
+            for at in around
+        ]
+        value = np.array([eval(EVERYTHING.partition("=")[2], each) for each in names])
         assert run.prediction[t] == pytest.approx(value[0], rel=1e-10)
         np.testing.assert_allclose(phi[t], (value[1:4] - value[4:]) / (2.0 * step), rtol=1e-6, atol=1e-7)
 

@@ -224,14 +224,14 @@ class Program:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         found = self._drivers.get((keep, steps))
         if found is None:
-            model, own, gate = self.model, self.steps if steps is None else steps, None
-            given = model.fitted_to(self.steps)[1]
-            if self.gate is not None:
-                implicit, lends = model.implicit is not None, not self.tracker.covariance
-                foresee = None if self.tracker.output_error else foreseeing(given, own)
-                gate = gate_step(self.gate, model.n, model.m, given.ages, given.refuse, implicit, lends, foresee)
-            found = drivers(given, own, keep, gate)
-            if gate is not None:
+            model, own = self.model.fitted_to(self.steps)[1], self.steps if steps is None else steps
+            if self.gate is None:
+                found = drivers(model, own, keep)
+            else:
+                foresee = None if self.tracker.output_error else foreseeing(model, own)
+                implicit, lends = self.model.implicit is not None, not self.tracker.covariance
+                given = self.model.n, self.model.m, model.ages, model.refuse, implicit, lends
+                found = drivers(model, own, keep, gate_step(self.gate, *given, foresee))
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
         return found
@@ -274,11 +274,8 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return (
-            1
-            if self.model.n > WIDEST_LANES or self.gate is not None
-            else min(self.model.steps.width, self.tracker.width)
-        )
+        alone = self.model.n > WIDEST_LANES or self.gate is not None
+        return 1 if alone else min(self.model.steps.width, self.tracker.width)
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -401,10 +398,9 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
 
 
 def _started(programs: Sequence[Program]) -> Array:
-    model = programs[0].model
+    model, tracker = programs[0].model, programs[0].tracker
     starts = {one: one.start for one in programs}
     memory, _ = model.fitted_to(programs[0].steps)
-    tracker = programs[0].tracker
     if both := sorted((set(memory) & set(programs[0].tracker_start)) - set(tracker.replaces)):
         raise ValueError(
             f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "

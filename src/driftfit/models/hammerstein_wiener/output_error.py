@@ -199,30 +199,33 @@ def _following(p: tuple[int, ...]) -> Step:
     return follow  # type: ignore[no-any-return]
 
 
+@kernel
+def advance_states(s: State, p: Places, m: Array, S: Array, scratch: Array, l: int) -> float:
+    """The time update of xi and w; returns the variance that missing inputs leave in w."""
+    n_w, n_x, d = max(p[AT.na], 1), s.theta.shape[0], p[AT.d_now]
+    theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
+    phi, v_power = floats(s.phi.ctypes.data, 1, p[AT.n])[0], floats(s.v_power.ctypes.data, 1, p[AT.inputs])[0]
+    for i in range(n_x):
+        for j in range(i + 1):
+            S[n_w + i, n_w + j] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
+    for k in range(p[AT.n_out] - 1):
+        m[d + k + 1, 0] = theta[p[AT.x_d] + k]
+    if s.begun[l] == 0.0 and m[NUMBER.started, 0] > 0.0:
+        past_levels(m, p, w, S, s.p_w[l])
+        s.begun[l] = 1.0
+    power = unknown_power(m, p, theta, v_power)
+    advance(p, theta, phi, w, S, scratch, s.q_w[l] + power, reach_of(m, p))
+    return power  # type: ignore[no-any-return]
+
+
 @lru_cache
 def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
     """The steps for the functions of an output basis and the places of a model."""
     orders, rows, n_w, curved = np.array(p), room(p), max(p[AT.na], 1), not p[AT.identity]
     n_out, d, free, g, h = p[AT.n_out], p[AT.d_now], p[AT.x_d], p[AT.trial], p[AT.trial_bend]
-    n_x, n, m_u = free + n_out - 1 + intercept, p[AT.n], p[AT.inputs]
+    n_x = free + n_out - 1 + intercept
     N, follow = n_w + n_x, _following(p)
     fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), shared(inverse_of(out).py_func)
-
-    @kernel
-    def advance_states(s: State, m: Array, S: Array, scratch: Array, l: int) -> float:
-        theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
-        phi, v_power = floats(s.phi.ctypes.data, 1, n)[0], floats(s.v_power.ctypes.data, 1, m_u)[0]
-        for i in range(n_x):
-            for j in range(i + 1):
-                S[n_w + i, n_w + j] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
-        for k in range(n_out - 1):
-            m[d + k + 1, 0] = theta[free + k]
-        if s.begun[l] == 0.0 and m[NUMBER.started, 0] > 0.0:
-            past_levels(m, orders, w, S, s.p_w[l])
-            s.begun[l] = 1.0
-        power = unknown_power(m, orders, theta, v_power)
-        advance(orders, theta, phi, w, S, scratch, s.q_w[l] + power, reach_of(m, orders))
-        return power  # type: ignore[no-any-return]
 
     @kernel
     def forecast(s: State, l: int) -> None:
@@ -231,7 +234,7 @@ def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
             floats(s.S.ctypes.data, N, N),
             floats(s.scratch.ctypes.data, 2, N),
         )
-        power = advance_states(s, m, S, scratch, l)
+        power = advance_states(s, orders, m, S, scratch, l)
         y_hat, y = s.w[0, l], m[NUMBER.raw, 0]
         if curved:
             y_hat = invert(m, orders, y_hat)

@@ -45,7 +45,6 @@ FIRST, RISE, FALL = 10.0, 10.0, 0.1
 """After the first samples, the factor by which the largest reading grows at most at one (before, by BEYOND); and the
 factor by which it falls at a reading that it is BEYOND times."""
 
-
 Y, YF, V, VF, E, EF, ONE, OWN = range(8)
 """Rows of the past: the output and D/C of it, v and 1/C v, e and 1/C e, D/C 1; then EACH rows for every input."""
 U, HELD, G, UF, W, WF, EACH = range(7)
