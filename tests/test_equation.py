@@ -49,14 +49,10 @@ def test_derivatives_are_exact_and_the_value_is_that_of_numpy():
     for t in range(10, 120):
         signals = {"u": Signal(u[: t + 1, 0]), "v": Signal(u[: t + 1, 1]), "y": Signal(y[: t + 1])}
         around = np.array(THETA) + step * np.r_[np.zeros((1, 3)), np.eye(3), -np.eye(3)]
-        names = [
-            vars(np)
-            | {"max": max, "min": min}
-            | signals
-            | {"theta": SimpleNamespace(**dict(zip("abc", at, strict=True)))}
-            for at in around
-        ]
-        value = np.array([eval(EVERYTHING.partition("=")[2], each) for each in names])
+        known = vars(np) | {"max": max, "min": min, **signals}
+        value = np.array(
+            [eval(EVERYTHING[4:], known | {"theta": SimpleNamespace(a=a, b=b, c=c)}) for a, b, c in around]
+        )
         assert run.prediction[t] == pytest.approx(value[0], rel=1e-10)
         np.testing.assert_allclose(phi[t], (value[1:4] - value[4:]) / (2.0 * step), rtol=1e-6, atol=1e-7)
 

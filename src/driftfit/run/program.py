@@ -274,8 +274,8 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        alone = self.model.n > WIDEST_LANES or self.gate is not None
-        return 1 if alone else min(self.model.steps.width, self.tracker.width)
+        most = min(self.model.steps.width, self.tracker.width)
+        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else most
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -310,9 +310,8 @@ class Program:
         return np.empty(T, output_type(tile, tuple(dict.fromkeys((*(GATED if self.gate else ()), *fields))), keep))
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
-        """(the routine that runs tiles like this one, an array for the results of T samples).
-
-        With ``collected`` it stores every sample as the tracker receives it, in double precision.
+        """(the routine that runs tiles like this one, an array for the results of T samples); with ``collected`` it stores
+        every sample as the tracker receives it, in double precision.
         """
         if not collected:
             return self.fill, self.written(tile, T, keep, dtype)
