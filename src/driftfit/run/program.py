@@ -310,8 +310,8 @@ class Program:
         return np.empty(T, output_type(tile, tuple(dict.fromkeys((*(GATED if self.gate else ()), *fields))), keep))
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
-        """(the routine that runs tiles like this one, an array for the results of T samples); with ``collected`` it stores
-        every sample as the tracker receives it, in double precision.
+        """(the routine that runs tiles like this one, an array for the results of T samples); with ``collected`` it
+        stores every sample as the tracker receives it, in double precision.
         """
         if not collected:
             return self.fill, self.written(tile, T, keep, dtype)
