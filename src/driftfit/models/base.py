@@ -124,7 +124,8 @@ class Model(Settings, ABC):
         None if past outputs are elsewhere, or are transformed; 0 where there are none. Of several outputs it is their
         number for each.
         """
-        return None if self.terms is None else sum(what == "y" and j == 0 for what, j, _ in self.terms)
+        own = [k for k, (what, j, _) in enumerate(self.terms or ()) if what == "y" and j == 0]
+        return None if self.terms is None or own != list(range(len(own))) else len(own)
 
     @property
     def terms(self) -> tuple[Term, ...] | None:
