@@ -28,15 +28,15 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_065,
-    "statements": 43_527,
+    "lines of the library": 67_063,
+    "statements": 43_529,
     "modules": 343,
     "levels of folders": 2,
     "constants of modules with numbers": 630,
     "numbers in the source": 2_464,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
-    "lines of them": 5_250,
+    "lines of them": 5_251,
     "modules that detection imports": 97,
     "modules that a second call of track passes": 9,
     "members of Tracker": 38,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 12_112,
-    "lines of tests": 33_492,
+    "lines of tests": 33_508,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
