@@ -29,30 +29,15 @@ def held(model, theta, y, u):
     return track(model, Kalman(q=0.0, r=1.0, p0=1e-20, theta0=tuple(theta)), y, u)
 
 
-class Signal(float):
-    """The present value of a signal, which knows those before it."""
-
-    def __new__(cls, values):
-        made = super().__new__(cls, values[-1])
-        made.values = values
-        return made
-
-    def __getitem__(self, lag):
-        return self.values[lag - 1]
-
-
 def test_derivatives_are_exact_and_the_value_is_that_of_numpy():
     y, u = data()
     model = Equation(EVERYTHING, start=dict(zip("abc", THETA, strict=True)))
     run, step = held(model, THETA, y, u), 1e-6
-    phi = replay(run)["phi"][..., 0]
+    phi, text = replay(run)["phi"][..., 0], EVERYTHING[4:].replace("[-", "_").replace("]", "")
     for t in range(10, 120):
-        signals = {"u": Signal(u[: t + 1, 0]), "v": Signal(u[: t + 1, 1]), "y": Signal(y[: t + 1])}
+        known = vars(np) | {"max": max, "min": min, "u": u[t, 0], "v": u[t, 1], "u_1": u[t - 1, 0], "y_2": y[t - 2]}
         around = np.array(THETA) + step * np.r_[np.zeros((1, 3)), np.eye(3), -np.eye(3)]
-        known = vars(np) | {"max": max, "min": min, **signals}
-        value = np.array(
-            [eval(EVERYTHING[4:], known | {"theta": SimpleNamespace(a=a, b=b, c=c)}) for a, b, c in around]
-        )
+        value = np.array([eval(text, known | {"theta": SimpleNamespace(a=a, b=b, c=c)}) for a, b, c in around])
         assert run.prediction[t] == pytest.approx(value[0], rel=1e-10)
         np.testing.assert_allclose(phi[t], (value[1:4] - value[4:]) / (2.0 * step), rtol=1e-6, atol=1e-7)
 
