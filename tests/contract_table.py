@@ -52,7 +52,7 @@ def unusable(tracker, model, signal, first, last=None):
     last = first if last is None else last
     if signal == "u":
         return list(range(first + 1, last + 3))  # nk = 1, nb = 2: the input of a sample is in phi of the next two
-    touched = [model.touched(place, signal) for place in range(first, last + 1)]
+    touched = [model.implicit and model.implicit.touched(place, signal) for place in range(first, last + 1)]
     if tracker.output_error or None in touched:
         return list(range(first, last + 1))
     return sorted({t for places in touched for t in places})

@@ -38,10 +38,10 @@ def damaged(y, u, seed=0, share=0.08):
 def run_lanes(model, trackers, y, u, known):
     """Drive a tile with one lane per tracker over y (T, L), u (T, m, L), known (T, 3, L); returns (out, tile)."""
     steps = trackers[0].steps_for(model)
-    memory = model.memory_for(steps)
+    memory, own = model.fitted_to(steps)
     tile = make_tile(model.n, model.m, memory, [tracker.state_for(model) for tracker in trackers])
     out = np.empty(len(y), output_type(tile, trackers[0].outputs))
-    drivers(model.steps_for(steps), steps).run(tile, y, u, known, out)
+    drivers(own, steps).run(tile, y, u, known, out)
     return out, tile
 
 

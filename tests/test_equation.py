@@ -1,12 +1,13 @@
 """Equations as text: what is refused, exact derivatives, linear equations as regressions, estimates, recovery."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Equation, Kalman, Live, Regression, track
 from driftfit.models.base import Model
-from driftfit.models.formula import parse
 from driftfit.parsing.expressions import read
 from driftfit.smooth.problem import replay
 
@@ -32,11 +33,11 @@ def test_derivatives_are_exact_and_the_value_is_that_of_numpy():
     y, u = data()
     model = Equation(EVERYTHING, start=dict(zip("abc", THETA, strict=True)))
     run, step = held(model, THETA, y, u), 1e-6
-    phi = replay(run)["phi"][..., 0]
+    phi, text = replay(run)["phi"][..., 0], EVERYTHING[4:].replace("[-", "_").replace("]", "")
     for t in range(10, 120):
-        signals = {"u": u[None, : t + 1, 0], "v": u[None, : t + 1, 1], "y": y[None, : t + 1]}
-        around = np.array(THETA)[:, None] + step * np.c_[np.zeros(3), np.eye(3), -np.eye(3)]
-        value = parse(EVERYTHING).value(around, signals)
+        known = vars(np) | {"max": max, "min": min, "u": u[t, 0], "v": u[t, 1], "u_1": u[t - 1, 0], "y_2": y[t - 2]}
+        around = np.array(THETA) + step * np.r_[np.zeros((1, 3)), np.eye(3), -np.eye(3)]
+        value = np.array([eval(text, known | {"theta": SimpleNamespace(a=a, b=b, c=c)}) for a, b, c in around])
         assert run.prediction[t] == pytest.approx(value[0], rel=1e-10)
         np.testing.assert_allclose(phi[t], (value[1:4] - value[4:]) / (2.0 * step), rtol=1e-6, atol=1e-7)
 

@@ -8,7 +8,7 @@ from support import arx_record, damaged
 from benchmarks import select_orders
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Regression, grid, select, track
 from driftfit.judge.structures.candidates import Predicted, mixed
-from driftfit.models.base import Model
+from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 
@@ -125,15 +125,13 @@ def test_average_follows_a_change_of_structure():
 
 
 def test_a_model_that_is_no_set_of_columns_runs_by_itself(record):
-    class Bent(Regression):
+    class Bent(Regression, Implicit):
         """A regression that claims a Jacobian, so that it is none of the known kinds."""
 
-        @property
-        def outputs(self):
-            return ("y",)
+        outputs, implicit = ("y",), property(lambda self: self)
 
-        def log_jacobian(self, theta, y):
-            return np.full(len(y), 0.25)
+        def output_slope(self, theta, y):
+            return np.full(len(y), np.exp(0.25))
 
     y, u = record
     models: list[Model] = [Regression(1), Bent(1)]

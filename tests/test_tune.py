@@ -8,6 +8,7 @@ import pytest
 from support import arx_record
 
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, Tracker, frontier, track, tune
+from driftfit.models.base import Implicit
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
@@ -295,11 +296,13 @@ def test_order_by_sorts_the_samples():
     assert np.isnan(track(Regression(2), a.tracker, y[order], u[order]).smooth(order_by=hidden).theta[0]).all()
 
 
-class Squared(Base):
+class Squared(Base, Implicit):
     """y is the square of what the regression explains: p(y) has a Jacobian that depends on y alone."""
 
-    def log_jacobian(self, theta, y):
-        return np.where(np.isfinite(y), -0.5 * np.ones(np.shape(y)), np.nan)
+    implicit = property(lambda self: self)
+
+    def output_slope(self, theta, y):
+        return np.where(np.isfinite(y), np.exp(-0.5), np.nan)
 
 
 def test_a_model_may_add_a_jacobian():

@@ -3,7 +3,7 @@
 from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, no_variance, unknown
 from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing
 from driftfit.engine.settings import Settings, numbers, one_of, vector, whole
-from driftfit.models.base import Model
+from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Basis
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.forms.covariance import prediction, read_drift
@@ -11,6 +11,7 @@ from driftfit.trackers.forms.covariance import prediction, read_drift
 __all__ = [
     "Array",
     "Basis",
+    "Implicit",
     "Model",
     "ModelSteps",
     "RandomWalk",

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 from driftfit.bank.results.live_results import LiveHypotheses
-from driftfit.models.hammerstein_wiener.blocks import Separator
+from driftfit.models.hammerstein_wiener.blocks import separated
 from driftfit.models.hammerstein_wiener.separation import Groups
 from driftfit.run.live import live
 from driftfit.use.constrained import Constrained, constrain
@@ -23,14 +22,9 @@ class Live(live.Live, public=True):
         """The events of a `Bank` now: probabilities, events as they are decided, the mixture for control."""
         return LiveHypotheses(self)
 
-    @cached_property
-    def _separator(self) -> Separator:
-        return Separator(self.model, self.names)
-
     def blocks(self, method: str = "svd-joint") -> Groups:
         """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, except "gls"."""
-        groups: Groups = self._separator(self.theta, method)
-        return groups
+        return separated(self.model, self.names, self.theta, method)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the future inputs.

@@ -121,7 +121,7 @@ def _reach(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     changed = np.flatnonzero((replay(track(model, still, y, u))["phi"] != replay(run)["phi"])[..., 0].any(axis=1))
     if changed.size and changed[0] < AT:
         yield f"It looks ahead: signals of sample {AT} are in the regressors of sample {changed[0]}."
-    endless = model.hidden is not None or model.held_at(run.theta[-1]) is not None  # regressors hold its own results
+    endless = model.hidden is not None or model.linearised is not None  # regressors hold its own results
     if changed.size and changed[-1] > AT + model.reach and not endless:
         yield f"reach is {model.reach}, but signals of sample {AT} are in the regressors of sample {changed[-1]}."
 
@@ -131,7 +131,7 @@ def _touched(model: Model, still: Tracker, run: Track) -> Iterator[str]:
         y, u = run.y.copy(), run.u.copy()
         (y if name == "y" else u)[AT] = np.nan
         lost = np.flatnonzero(run.ok & ~track(model, still, y, u).ok)
-        declared = model.touched(AT, name)
+        declared = None if model.implicit is None else model.implicit.touched(AT, name)
         expected = [AT] if declared is None and name == "y" else None if declared is None else list(declared)
         if expected is not None and lost.tolist() != expected:
             yield f"A missing {name} at sample {AT} makes samples {lost.tolist()} unusable; declared: {expected}."
@@ -158,14 +158,16 @@ def _regressors(model: Model, still: Tracker, run: Track) -> Iterator[str]:
 def _density(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     y, ok = run.y.copy(), run.ok
     error = (run.y - run.prediction)[ok]
-    if not model.implicit:
+    if model.implicit is None:
         if not np.allclose(run.innovation[ok], error, atol=1e-9):
             yield "The innovation is not y minus its prediction; a model with another residual declares `implicit`."
         return
     step = 1e-6
     y[AT] += step
     slope = abs(track(model, still, y, run.u).innovation[AT] - run.innovation[AT]) / step
-    if not np.isclose(np.log(slope), model.log_jacobian(run.theta[AT : AT + 1], run.y[AT : AT + 1])[0], atol=1e-4):
+    if not np.isclose(
+        np.log(slope), model.implicit.log_jacobian(run.theta[AT : AT + 1], run.y[AT : AT + 1])[0], atol=1e-4
+    ):
         yield f"log_jacobian is not the logarithm of the slope of the innovation against y, which is {slope:.6g}."
 
 
@@ -190,7 +192,7 @@ def _forward(model: Model, still: Tracker, run: Track) -> Iterator[str]:
 
 
 def _late_input(model: Model, still: Tracker, run: Track) -> Iterator[str]:
-    if model.apply is None or not model.m:
+    if model.steps.apply is None or not model.m:
         return
     live = Live(model, still)
     for t in range(T):

@@ -75,7 +75,7 @@ def _fields(made: Translation, names: tuple[str, ...]) -> str:
 
 def _source(made: Translation, program: Program) -> str:
     """Tables, functions and the public interface."""
-    memory = set(program.model.memory_for(program.steps))
+    memory = set(program.model.fitted_to(program.steps)[0])
     steps = "\n\n".join(function.text for function in made.unit.functions.values())
     support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"

@@ -63,17 +63,31 @@ def no_preparation(L: int) -> None:
     """Steps that call nothing by symbol need none."""
 
 
+@kernel
+def nothing_remembered(s: State, signal: int, age: int, l: int) -> None:
+    """Nothing of an input is kept after its sample."""
+
+
 class ModelSteps(NamedTuple):
     """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
     ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
     ``foreseeing(forecast)``, where phi contains y, is the step that writes y_hat, e and s before y is seen, for a gate.
+    ``apply`` stores the input of a sample, ``s.u``, after the sample, and leaves the record as if it had come with the
+    output; None if an output needs the input of its own sample. An input is remembered for ``ages`` samples after its
+    own. ``refuse(s, signal, age, l)`` makes column ``signal`` of u, read ``age`` samples ago (0: now), missing: what
+    uses it from the next sample on is unusable. ``width`` series share a tile in a fleet, 1 where steps take one lane
+    at a time.
     """
 
     regress: Step
     push: Step
     ready: Callable[[int], None] = no_preparation
     foreseeing: Callable[[Step], Step] | None = None
+    apply: Step | None = None
+    ages: int = 0
+    refuse: Any = nothing_remembered
+    width: int = 32
 
 
 @kernel

@@ -5,12 +5,12 @@
 
 A direction that the regressors have not yet spanned has a zero on the diagonal, and its parameter is 0 until they span
 it. The result is the estimate of ``RLS(1.0)`` from a diffuse start, without its covariance: a start with poor
-regressors is forgotten (`Model.settling`). The work is done by one routine on the arrays of one lane, compiled once for
-all models. Cost per sample: O(n^2).
+regressors is forgotten (`Linearised.settling`). One routine works on the arrays of one lane, compiled once for all
+models. Cost per sample: O(n^2).
 
 Of a model that is linearised at its estimates, the start is too poor for a comparison with trackers, which forget it as
 well. Its constants are fitted twice, the second time with the linearisation held where the first ended
-(`Model.held_at`): this is one step of Gauss and Newton from there, with regressors as good at the start as at the end.
+(`Linearised.held_at`): one step of Gauss and Newton from there, with regressors as good at the start as at the end.
 Their errors are one step ahead in the constants, but not in the linearisation, which knows the whole record.
 """
 
@@ -99,10 +99,11 @@ STEPS = TrackerSteps(stay, forecast, learn, unknown, store=collect)
 @lru_cache(64)
 def _start(model: Model) -> Array:
     """The tile of a model before its first sample."""
-    n = model.n
+    n, linearised = model.n, model.linearised
+    settling = (linearised.settling, linearised.settling_memory) if linearised else (0.0, 0.0)
     state = {
         "theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0,
-        "weight": 1.0, "settling": model.settling, "settling_memory": model.settling_memory,
+        "weight": 1.0, "settling": settling[0], "settling_memory": settling[1],
     }  # fmt: skip
     return make_tile(n, model.m, model.memory(), [state])
 
@@ -114,8 +115,10 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     those of a regression: none of them is usable.
     """
     first = _fitted(model, record)
-    held = model.held_at(first["theta"][-1, :, 0]) if model.settling > 0.0 and len(record) else None
-    return first if held is None else _fitted(held, record)
+    linearised = model.linearised
+    if linearised is None or linearised.settling == 0.0 or not len(record):
+        return first
+    return _fitted(linearised.held_at(first["theta"][-1, :, 0]), record)
 
 
 def _fitted(model: Model, record: Record) -> Array:

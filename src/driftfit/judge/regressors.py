@@ -109,7 +109,8 @@ def regressors(run: Track, steady: Array | None = None) -> Rows:
     noise = run.known.part(at).noise
     root = 1.0 / np.sqrt(noise)
     y = out["y"][at, 0]
-    phi = run.model.settled(out["phi"][at, :, 0], y, run.u, at)
+    phi = out["phi"][at, :, 0]
+    phi = phi if run.model.implicit is None else run.model.implicit.settled(phi, y, run.u, at)
     step, lags = step_of(run.y), earlier_outputs(run, at, phi, out["y"][:, 0], root)
     scaled = phi * np.reshape(root, (-1, 1)), y * root
     return Rows(at, *scaled, step * np.broadcast_to(root, at.shape) if step else None, lags, root * np.ones(len(at)))

@@ -9,24 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
 
 Term = tuple[str, int, int]
 """A regressor: ("y", output, lag), ("u", input, lag), or ("1", 0, 0) for the constant 1."""
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
-
-
-@kernel
-def nothing_remembered(s: State, signal: int, age: int, l: int) -> None:
-    """Nothing of an input is kept after its sample."""
-
-
-@kernel
-def refuse_lag(s: State, signal: int, age: int, l: int) -> None:
-    """`Model.refuse` for inputs whose lags are in ``u_lag``, the newest first."""
-    s.u_lag[signal, age, l] = np.nan
 
 
 class Model(Settings, ABC):
@@ -39,8 +28,6 @@ class Model(Settings, ABC):
 
     intercept: bool = False
     """Whether the last regressor is the constant 1."""
-    ny: Any = 1
-    """Outputs: how many, or their names."""
     constant: ClassVar[str] = ""
     """The setting that adds a constant to the prediction, of a model that predicts none without it."""
 
@@ -77,11 +64,6 @@ class Model(Settings, ABC):
         return len(self.names)
 
     @property
-    def width(self) -> int:
-        """Series that share a tile in a fleet; 1 where the regression is a routine that takes one lane at a time."""
-        return 32
-
-    @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs; several outputs are run by `driftfit.run.fleet`."""
         return ("y",)
@@ -90,11 +72,6 @@ class Model(Settings, ABC):
     def shared(self) -> bool:
         """Whether all outputs measure one theta, instead of having one each."""
         return False
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """For every parameter the signal that its regressor holds, empty for a constant; of several outputs."""
-        return self.input_names if len(self.input_names) == self.n else ("",) * self.n
 
     def names_of(self, output: str) -> tuple[str, ...]:
         """Names of the parameters of one of several outputs."""
@@ -116,42 +93,21 @@ class Model(Settings, ABC):
     @property
     @abstractmethod
     def steps(self) -> ModelSteps:
-        """The compiled ``regress`` and ``push``."""
+        """The compiled steps."""
+
+    def fitted_to(self, tracker: TrackerSteps) -> tuple[Mapping[str, Any], ModelSteps]:
+        """`memory` and `steps` with a tracker that marks readings as outliers, or needs instruments."""
+        return self.memory(), self.steps
 
     @property
-    def instruments(self) -> bool:
-        """Whether, with a tracker that asks for them (`TrackerSteps.instruments`), it writes instruments to s.zeta."""
-        return False
-
-    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
-        """`memory` with a tracker that marks readings as outliers, or needs instruments; see `TrackerSteps`."""
-        return self.memory()
-
-    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
-        """`steps` with such a tracker."""
-        return self.steps
-
-    @property
-    def apply(self) -> Step | None:
-        """The compiled step that stores the input of a sample, ``s.u``, after the sample has been processed.
-
-        It must leave the record as if the input had come with the output. None if an output needs the input of its own
-        sample, because then it cannot be predicted before the input is known.
-        """
+    def implicit(self) -> Implicit | None:
+        """What the model declares if its regressors hold the present output, so the innovation is not that of y."""
         return None
 
     @property
-    def input_memory(self) -> int:
-        """For how many samples after its own an input is remembered; `refuse` takes it from there."""
-        return 0
-
-    @property
-    def refuse(self) -> Any:
-        """The compiled function ``refuse(s, signal, age, l)`` that makes an input missing: column ``signal`` of u, read
-        ``age`` samples ago (0: now). What uses it from the next sample on is unusable, as for an input that was never
-        there.
-        """
-        return nothing_remembered
+    def linearised(self) -> Linearised | None:
+        """What the model declares if its regressors depend on theta."""
+        return None
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that do not suit the model; `track` calls it with the whole record, y (T,), u (T, m)."""
@@ -162,39 +118,18 @@ class Model(Settings, ABC):
         return response
 
     @property
-    def implicit(self) -> bool:
-        """Whether the regressors hold the present output, so that innovations are not those of y: `log_jacobian`.
-
-        True for a model that defines `log_jacobian`.
-        """
-        return type(self).log_jacobian is not Model.log_jacobian
-
-    def log_jacobian(self, theta: Array, y: Array) -> Array:
-        """Logarithm (T,) of the slope of the innovation against y, at theta (T, n) after each sample and y (T,).
-
-        It turns the density of the innovation into that of y; 0 unless the model is `implicit`.
-        """
-        return np.zeros(len(y))
-
-    @property
     def output_lags(self) -> int | None:
         """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
 
-        None if past outputs are elsewhere, or are transformed; 0 where there are none.
+        None if past outputs are elsewhere, or are transformed; 0 where there are none. Of several outputs it is their
+        number for each.
         """
-        return None
+        own = [k for k, (what, j, _) in enumerate(self.terms or ()) if what == "y" and j == 0]
+        return None if self.terms is None or own != list(range(len(own))) else len(own)
 
     @property
     def terms(self) -> tuple[Term, ...] | None:
         """What every regressor is, if all are signals of this or an earlier sample, or 1; None for any other model."""
-        return None
-
-    def touched(self, t: int, signal: str) -> range | None:
-        """Samples that cannot be used when "y" or "u" is missing at t; None where missing outputs are filled in."""
-        return None
-
-    def expand(self, theta: Array) -> Array | None:
-        """theta (.., n) from parameters (.., k) that a tracker follows instead; None where they do not define it."""
         return None
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
@@ -208,41 +143,9 @@ class Model(Settings, ABC):
         )
 
     @property
-    def noise_varies(self) -> bool:
-        """Whether `noise_factor` is anything but 1."""
-        return False
-
-    @property
     def reach(self) -> int:
         """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
-        return 0
-
-    @property
-    def settling(self) -> float:
-        """Number of first samples whose regressors are poor, because they depend on theta, and should be forgotten."""
-        return 0.0
-
-    @property
-    def settling_memory(self) -> float:
-        """Memory of the first of them, in samples."""
-        return 0.1 * self.settling
-
-    @property
-    def unequal_start(self) -> bool:
-        """Whether first innovations are far larger, because a model of the noise is not known yet."""
-        return False
-
-    def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
-        """Regressors phi (N, n) of the usable samples ``at`` (N,), with outputs y (N,), of a whole record u (T, m).
-
-        A model that takes settings of its functions from its estimates holds them at one value for all samples, because
-        a judgement of the record would mistake their first values for a change of the parameters.
-        """
-        return phi
-
-    def held_at(self, theta: Array) -> Model | None:
-        """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
-        return None
+        return max((lag for _, _, lag in self.terms or ()), default=0)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.
@@ -267,14 +170,73 @@ class Model(Settings, ABC):
             "the methods `reach` and `play` (driftfit.models.base)."
         )
 
+    def follows(self, other: Model) -> bool:
+        """Whether the memory of the other model is that of this one, so that its run can be continued."""
+        return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)
+
+
+class Implicit(ABC):
+    """What a model declares whose regressors hold the present output: its innovation is the error of an equation."""
+
+    @property
+    def noise_varies(self) -> bool:
+        """Whether `noise_factor` is anything but 1."""
+        return False
+
+    @abstractmethod
     def output_slope(self, theta: Array, y: Array) -> Array:
-        """Derivative of the fitted quantity with respect to y, at outputs y (...): for its errors in y."""
-        return np.ones(np.shape(y))
+        """Slope (T,) of the innovation against y, above 0, at theta (T, n) after each sample and y (T,)."""
+
+    def log_jacobian(self, theta: Array, y: Array) -> Array:
+        """Its logarithm (T,), which turns the density of the innovation into that of y."""
+        with np.errstate(invalid="ignore"):
+            found: Array = np.log(self.output_slope(theta, y))
+        return found
 
     def noise_factor(self, theta: Array, y: Array) -> float:
         """Factor of the noise variance of a tracker at an output."""
         return 1.0
 
-    def follows(self, other: Model) -> bool:
-        """Whether the memory of the other model is that of this one, so that its run can be continued."""
-        return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)
+    def touched(self, t: int, signal: str) -> range | None:
+        """Samples that cannot be used when "y" or "u" is missing at t; None where missing outputs are filled in."""
+        return None
+
+    def expand(self, theta: Array) -> Array | None:
+        """theta (.., n) from parameters (.., k) that a tracker follows instead; None where they do not define it."""
+        return None
+
+    def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
+        """Regressors phi (N, n) of the usable samples ``at`` (N,), with outputs y (N,), of a whole record u (T, m).
+
+        A model that takes settings of its functions from its estimates holds them at one value for all samples, because
+        a judgement of the record would mistake their first values for a change of the parameters.
+        """
+        return phi
+
+
+class Linearised(ABC):
+    """What a model declares whose regressors depend on theta, as those of a transfer function do."""
+
+    @property
+    def unequal_start(self) -> bool:
+        """Whether first innovations are far larger, because a model of the noise is not known yet."""
+        return False
+
+    @property
+    @abstractmethod
+    def settling(self) -> float:
+        """Number of first samples whose regressors are poor, and should be forgotten."""
+
+    @property
+    def settling_memory(self) -> float:
+        """Memory of the first of them, in samples."""
+        return 0.1 * self.settling
+
+    @property
+    def instruments(self) -> bool:
+        """Whether, with a tracker that asks for them (`TrackerSteps.instruments`), it writes instruments to s.zeta."""
+        return False
+
+    @abstractmethod
+    def held_at(self, theta: Array) -> Model:
+        """This model with its linearisation held at theta (n,), so that a run is a linear regression."""

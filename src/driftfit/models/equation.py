@@ -33,17 +33,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.models.base import GAP, refuse_lag
-from driftfit.models.formula import Formula, compiled, parse, start_values
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.models.base import GAP
+from driftfit.models.formula import Formula, compiled, complete_with, in_numpy, parse, start_values
 from driftfit.models.inputs import NamedInputs
-from driftfit.models.lags import shift_inputs
-from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
+from driftfit.models.lags import informed, refuse_lag, shift_inputs
+from driftfit.models.linearised import MEMORY, along, restore, subtract
 
 SETTLING = 10.0
 """Usable samples for each parameter in which the point of linearisation goes from the start to the estimate."""
@@ -91,34 +92,22 @@ class Equation(NamedInputs):
         return (self.formula.output,)
 
     @property
-    def begins(self) -> Array:
-        """The point (n,) at which the linearisation begins."""
-        if isinstance(self.start, tuple):
-            given = dict(self.start)
-            return np.array([given.get(name, 1.0) for name in self.names])
-        return np.full(self.n, float(self.start))
-
-    @property
-    def input_memory(self) -> int:
-        return self.reach
-
-    @property
-    def refuse(self) -> Any:
-        return refuse_lag
-
-    @property
     def reach(self) -> int:
         return self.formula.reach
 
     @property
+    def remembers_outputs(self) -> bool:
+        return bool(self.formula.lags_of(self.formula.output))
+
+    @property
     def output_lags(self) -> int | None:
-        return None if self.formula.lags_of(self.formula.output) else 0
+        return None if self.remembers_outputs else 0
 
     def memory(self) -> Mapping[str, Any]:
         depth = self.reach + 1
         return {
-            "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan), "point": self.begins,
-            "first_point": self.begins, "value": 0.0, **MEMORY,
+            "y_lag": np.full((1, depth), np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
+            "point": self.begins, "first_point": self.begins, "value": 0.0, **MEMORY,
         }  # fmt: skip
 
     @property
@@ -126,41 +115,20 @@ class Equation(NamedInputs):
         return _steps(self.equation, self.input_names)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
-        p, h = y.shape[1], noise.shape[1]
-        out = np.concatenate([y, np.zeros((len(theta), h))], axis=1)
+        p, h, value = y.shape[1], noise.shape[1], in_numpy(self.equation, self.input_names)
+        out, s = np.concatenate([y, np.zeros((len(theta), h))], axis=1), SimpleNamespace(point=theta.T)
         for k in range(h):
-            t = p + k
-            signals = {name: u[:, : t + 1, j] for j, name in enumerate(self.input_names)}
-            signals[self.formula.output] = out[:, : t + 1]
-            out[:, t] = self.formula.value(theta.T, signals) + noise[:, k]
+            recent = slice(p + k - self.reach, p + k + 1)
+            s.y_lag, s.u_lag = out.T[None, recent][:, ::-1], u.T[:, recent][:, ::-1]
+            with np.errstate(all="ignore"):
+                out[:, p + k] = value(s, slice(None)) + noise[:, k]
         return out[:, p:]
 
-    def noise_response(self, theta: Array, h: int) -> Array:
-        """1, then 0 without output lags; with them it depends on the operating point and is NaN."""
-        response: Array = np.eye(1, h)[0]
-        if self.formula.lags_of(self.formula.output):
-            response[1:] = np.nan
-        return response
 
-
-def _complete(formula: Formula, inputs: tuple[str, ...]) -> Step:
-    """``complete(s, l)``: whether all inputs and lags are known; tanh, min or a condition has a value without them."""
-    used = sorted({(inputs.index(name), lag) for name, lag in formula.lags if name in inputs})
-    of_input, with_lag = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,)
-    own = tuple(sorted(formula.lags_of(formula.output))) or (0,)
-    count, owned = len(used), len(formula.lags_of(formula.output))
-
-    @kernel
-    def complete(s: State, l: int) -> bool:
-        known = True
-        for k in range(count):
-            known = known & (abs(s.u_lag[of_input[k], with_lag[k], l]) < LARGEST)
-        for k in range(owned):
-            known = known & (abs(s.y_lag[own[k], l]) < LARGEST)
-        return known
-
-    step: Step = complete
-    return step
+@kernel
+def known_lag(s: State, j: int, lag: int, l: int) -> bool:
+    """Whether input j was known that many samples ago."""
+    return abs(s.u_lag[j, lag, l]) < LARGEST  # type: ignore[no-any-return]
 
 
 @lru_cache
@@ -168,13 +136,13 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
     formula = parse(equation)
     m, n, reach = len(inputs), len(formula.parameters), formula.reach
     evaluate = compiled(equation, inputs)
-    complete = _complete(formula, inputs)
+    complete = complete_with(known_lag, [formula], inputs, formula.output)
 
     @kernel
     def age(s: State, l: int) -> None:
         broken = s.dt[l] > GAP
         for i in range(reach, 0, -1):
-            s.y_lag[i, l] = np.nan if broken else s.y_lag[i - 1, l]
+            s.y_lag[0, i, l] = np.nan if broken else s.y_lag[0, i - 1, l]
         shift_inputs(s, m, l)
 
     @kernel
@@ -205,11 +173,11 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         predicted = informed(s, l)
         known = predicted & (s.without[l] < reach)
         restore(s, observed, l)
-        s.y_lag[0, l] = s.measured[l] if observed else (s.y_hat[l] if known else np.nan)
+        s.y_lag[0, 0, l] = s.measured[l] if observed else (s.y_hat[l] if known else np.nan)
         share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
         share = share if (s.moved_on[l] > 0.0) | (s.usable[l] >= SETTLING * n) else 0.0
         for i in range(n):
             moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
             s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]
 
-    return ModelSteps(regress, push)
+    return ModelSteps(regress, push, ages=reach, refuse=refuse_lag)

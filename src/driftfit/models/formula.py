@@ -1,4 +1,4 @@
-"""Formulas as text: their parts, their value in numpy, and compiled code for the value and its derivatives.
+"""Formulas as text: their parts, and code for the value and its derivatives, compiled or for NumPy.
 
 The text is read as a syntax tree, of which only arithmetic, comparisons, a conditional expression, names, lags and the
 functions of `FUNCTIONS` are accepted. The tree is translated into code with one operation per line, each followed by
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, exp, kernel, log
+from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.engine.settings import numbers
 
 FORMULA_LENGTH = 20000
@@ -53,53 +53,6 @@ class Formula:
     def lags_of(self, signal: str) -> tuple[int, ...]:
         """The lags of a signal that the expression uses."""
         return tuple(lag for name, lag in self.lags if name == signal)
-
-    def value(self, theta: Array, signals: Mapping[str, Array]) -> Array:
-        """The expression for parameters (n, D) and signals (D or 1, t + 1) up to the present sample; (D,)."""
-        with np.errstate(all="ignore"):
-            return np.broadcast_to(self._value(self.tree, theta, signals), theta.shape[1:])
-
-    def _value(self, node: ast.expr, theta: Array, signals: Mapping[str, Array]) -> Any:
-        def at(one: ast.expr) -> Any:
-            return self._value(one, theta, signals)
-
-        match node:
-            case ast.Constant():
-                return node.value
-            case ast.Name():
-                return np.pi if node.id == "pi" else signals[node.id][:, -1]
-            case ast.Attribute():
-                return theta[self.parameters.index(node.attr)]
-            case ast.Subscript():
-                return signals[node.value.id][:, -1 - _lag(node)]  # type: ignore[attr-defined]
-            case ast.UnaryOp():
-                return -at(node.operand) if isinstance(node.op, ast.USub) else at(node.operand)
-            case ast.BinOp():
-                return _BINARY[type(node.op)](at(node.left), at(node.right))
-            case ast.IfExp():
-                test = at(node.test)
-                return np.where(np.isnan(test), np.nan, np.where(test, at(node.body), at(node.orelse)))
-            case ast.Compare():
-                left, right = at(node.left), at(node.comparators[0])
-                holds = _COMPARE[type(node.ops[0])](left, right)
-                return np.where(np.isnan(left) | np.isnan(right), np.nan, holds)  # what is missing decides nothing
-            case ast.Call():
-                return _CALLS[node.func.id](*(at(one) for one in node.args))  # type: ignore[attr-defined]
-        raise AssertionError(node)
-
-
-_BINARY: dict[Any, Any] = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-    ast.Pow: lambda x, p: np.power(np.asarray(x, dtype=float), p),
-}  # fmt: skip
-_COMPARE: dict[Any, Any] = {
-    ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal, ast.Eq: np.equal,
-    ast.NotEq: np.not_equal,
-}  # fmt: skip
-_CALLS: dict[str, Any] = {
-    "abs": np.abs, "cos": np.cos, "exp": np.exp, "log": np.log, "max": np.maximum, "min": np.minimum, "sin": np.sin,
-    "sqrt": np.sqrt, "tanh": np.tanh,
-}  # fmt: skip
 
 
 def _lag(node: ast.Subscript) -> int:
@@ -178,8 +131,8 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
 class Writer:
     """Lines of code for a tree, and the names of their results: value, and derivatives by parameter."""
 
-    def __init__(self, formula: Formula, inputs: tuple[str, ...]) -> None:
-        self.formula, self.inputs = formula, inputs
+    def __init__(self, formula: Formula, inputs: tuple[str, ...], differentiates: bool = True) -> None:
+        self.formula, self.inputs, self.differentiates = formula, inputs, differentiates
         self.lines: list[str] = []
 
     def let(self, code: str) -> str:
@@ -193,7 +146,7 @@ class Writer:
                 return repr(float(node.value)), {}  # type: ignore[arg-type]
             case ast.Attribute():
                 i = self.formula.parameters.index(node.attr)
-                return self.let(f"s.point[{i}, l]"), {i: "1.0"}
+                return self.let(f"s.point[{i}, l]"), {i: "1.0"} if self.differentiates else {}
             case ast.Name():
                 return (repr(float(np.pi)), {}) if node.id == "pi" else self.signal(node.id, 0)
             case ast.Subscript():
@@ -215,7 +168,7 @@ class Writer:
 
     def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
         if name == self.formula.output:
-            return self.let(f"s.y_lag[{lag}, l]"), {}
+            return self.let(f"s.y_lag[0, {lag}, l]"), {}
         return self.let(f"s.u_lag[{self.inputs.index(name)}, {lag}, l]"), {}
 
     def _scaled(self, factor: str, x: str, dx: dict[int, str]) -> tuple[str, dict[int, str]]:
@@ -225,8 +178,8 @@ class Writer:
         """``one`` where the test holds."""
         (a, da), (b, db) = one, other
         both = sorted({*da, *db})
-        value = self.let(f"{a} if {test} else {b}")
-        return value, {i: self.let(f"{da.get(i, '0.0')} if {test} else {db.get(i, '0.0')}") for i in both}
+        value = self.let(f"chosen({test}, {a}, {b})")
+        return value, {i: self.let(f"chosen({test}, {da.get(i, '0.0')}, {db.get(i, '0.0')})") for i in both}
 
     def _sum(self, *terms: tuple[str, dict[int, str]]) -> dict[int, str]:
         """The derivatives sum_k factor_k d_k of a function with these partial derivatives."""
@@ -260,7 +213,7 @@ class Writer:
             value = self.let(_product(a, abs(p)) if p >= 0 else f"1.0 / ({_product(a, -p)})")
             less = _product(a, p - 1) if p >= 1 else f"(1.0 / ({_product(a, 1 - p)}))"
             return value, self._sum((f"{float(p)!r} * ({less})", da))
-        logarithm = self.let(f"log({a}) if {a} > 0.0 else np.nan")
+        logarithm = self.let(f"chosen({a} > 0.0, log({a}), np.nan)")
         value = self.let(f"exp({b} * {logarithm})")
         return value, self._sum((f"({b} * {value} / {a})", da), (f"({value} * {logarithm})", db))
 
@@ -270,7 +223,7 @@ class Writer:
             case "max" | "min":
                 return self._chosen(self.let(f"{a} {'>' if name == 'max' else '<'} {given[1][0]}"), *given)
             case "abs":
-                return self.let(f"abs({a})"), self._sum((f"(1.0 if {a} >= 0.0 else -1.0)", da))
+                return self.let(f"abs({a})"), self._sum((f"chosen({a} >= 0.0, 1.0, -1.0)", da))
             case "sqrt":
                 value = self.let(f"np.sqrt({a})")
                 return value, self._sum((f"(0.5 / {value})", da))
@@ -278,7 +231,7 @@ class Writer:
                 value = self.let(f"exp({a})")
                 return value, self._sum((value, da))
             case "log":
-                return self.let(f"log({a}) if {a} > 0.0 else np.nan"), self._sum((f"(1.0 / {a})", da))
+                return self.let(f"chosen({a} > 0.0, log({a}), np.nan)"), self._sum((f"(1.0 / {a})", da))
             case "tanh":
                 value = self.let(f"1.0 - 2.0 / (exp(2.0 * {a}) + 1.0)")
                 return value, self._sum((f"(1.0 - {value} * {value})", da))
@@ -307,6 +260,28 @@ def start_values(model: str, given: Any, names: Sequence[str]) -> Any:
     return tuple((name, numbers(model, "start", value, ndim=0)) for name, value in found.items())
 
 
+def complete_with(known: Any, lines: Sequence[Formula], inputs: tuple[str, ...], output: str) -> Any:
+    """``complete(s, l)``: whether the lags of the output and the inputs that the lines use are known; tanh, min or a
+    condition has a value without them. ``known(s, j, lag, l)`` says it of an input.
+    """
+    lags = {pair for line in lines for pair in line.lags}
+    used = sorted((inputs.index(name), lag) for name, lag in lags if name in inputs)
+    own = tuple(sorted(lag for name, lag in lags if name == output))
+    of_input, with_lag, at = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,), own or (0,)
+    count, owned = len(used), len(own)
+
+    @kernel
+    def complete(s: State, l: int) -> bool:
+        found = True
+        for k in range(count):
+            found = found & known(s, of_input[k], with_lag[k], l)
+        for k in range(owned):
+            found = found & (abs(s.y_lag[0, at[k], l]) < LARGEST)
+        return found
+
+    return complete
+
+
 @lru_cache(maxsize=256)
 def compiled(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
     """The kernel that writes s.value and s.phi at s.point, from s.y_lag and s.u_lag (a row for each input)."""
@@ -318,15 +293,41 @@ def compiled(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
     return written("evaluate", lines)
 
 
+@kernel
+def chosen(test: bool, one: float, other: float) -> float:
+    """``one`` where the test holds."""
+    return one if test else other
+
+
+COMPILED = {"exp": exp, "log": log, "chosen": chosen}
+IN_NUMPY = {"exp": np.exp, "log": np.log, "chosen": np.where}
+
+
 def written(name: str, lines: Sequence[str]) -> Callable[..., Any]:
     """The kernel ``name(s, l)`` of these lines, which hold nothing but arithmetic.
 
     Its source is known to `inspect`, from which exported trackers are translated.
     """
+    made: Callable[..., Any] = kernel(_made(name, lines, COMPILED))
+    return made
+
+
+@lru_cache(maxsize=256)
+def in_numpy(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
+    """``value(s, l)`` for a whole array of lanes l; NaN where a signal is."""
+    formula = parse(text)
+    writer = Writer(formula, inputs, differentiates=False)
+    value, _ = writer.write(formula.tree)
+    signals = " + ".join(["0.0", *(writer.signal(*one)[0] for one in formula.lags)])
+    lines = [*writer.lines, f"return chosen(np.isnan({signals}), np.nan, {value})"]
+    made: Callable[..., Any] = _made("value", lines, IN_NUMPY)
+    return made
+
+
+def _made(name: str, lines: Sequence[str], known: Mapping[str, Any]) -> Any:
     code = f"def {name}(s, l):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
     place = f"<{name} {sha256(code.encode()).hexdigest()[:16]}>"
     linecache.cache[place] = len(code), None, code.splitlines(True), place
-    known: dict[str, Any] = {"np": np, "exp": exp, "log": log, "__name__": __name__}
-    exec(compile(code, place, "exec"), known)
-    made: Callable[..., Any] = kernel(known[name])
-    return made
+    names: dict[str, Any] = {"np": np, "__name__": __name__, **known}
+    exec(compile(code, place, "exec"), names)
+    return names[name]

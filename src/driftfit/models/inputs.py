@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Self
@@ -12,7 +13,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import input_names, numbers, whole
-from driftfit.models.base import Model
+from driftfit.models.base import Linearised, Model
 
 TAIL, DEVIATIONS = 0.02, 2.0
 """An input is far from 0 if all but the share `TAIL` of its values are, by `DEVIATIONS` times their usual deviation
@@ -118,7 +119,7 @@ class CountedInputs(Model):
         return value if isinstance(value, tuple) else (value,) * self.m
 
 
-class LinearisedTransfer(CountedInputs):
+class LinearisedTransfer(CountedInputs, Linearised):
     """A transfer function whose regressors depend on theta; ``point`` holds them at one theta."""
 
     point: tuple[float, ...] | None
@@ -131,6 +132,10 @@ class LinearisedTransfer(CountedInputs):
         self._set("point", numbers(kind, "point", self.point, ndim=1))
         if self._given is not None and np.size(self.point) != self.n:
             raise ValueError(f"{kind}: point must have {self.n} entries, {', '.join(self.names)}; got {self.point!r}.")
+
+    @property
+    def linearised(self) -> Linearised:
+        return self
 
     @property
     def simulated(self) -> tuple[bool, ...]:
@@ -158,9 +163,32 @@ class LinearisedTransfer(CountedInputs):
 
 
 class NamedInputs(Model):
-    """A model of equations, which name its inputs; the setting ``inputs`` gives their order, unless it is None."""
+    """A model of equations, which name its inputs; the setting ``inputs`` gives their order, unless it is None.
+
+    ``start`` holds parameters and states before the first sample: one number for all, or (name, number) pairs.
+    """
 
     inputs: Any
+    start: Any
+
+    @property
+    @abstractmethod
+    def remembers_outputs(self) -> bool:
+        """Whether the equations use lags of the output."""
+
+    @property
+    def begins(self) -> Array:
+        """``start`` as an array (n,), with 1 for parameters that are not named and 0 for states."""
+        if not isinstance(self.start, tuple):
+            return np.full(self.n, float(self.start))
+        given = dict(self.start)
+        return np.array([given.get(name, float(name not in (self.hidden or ()))) for name in self.names])
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """1, then 0 without lags of the output; with them it depends on the operating point and is NaN."""
+        response: Array = np.eye(1, h)[0]
+        response[1:] = np.nan if self.remembers_outputs else 0.0
+        return response
 
     def _check_inputs(self, used: Sequence[str]) -> None:
         """Take the inputs that the equations use, or check that the given ones contain them."""

@@ -70,17 +70,36 @@ def wait_for_lags(s: State, l: int) -> None:
 
 
 @kernel
-def take_output(s: State, na: int, l: int) -> None:
-    """The output is its first lag; where it is missing its prediction, for na samples in a row.
+def take_input(s: State, l: int) -> None:
+    """`ModelSteps.apply`: the present input is the first of its lags."""
+    for j in range(s.u_lag.shape[0]):
+        s.u_lag[j, 0, l] = s.u[j, l]
+
+
+@kernel
+def refuse_lag(s: State, signal: int, age: int, l: int) -> None:
+    """`ModelSteps.refuse`."""
+    s.u_lag[signal, age, l] = np.nan
+
+
+@kernel
+def informed(s: State, l: int) -> bool:
+    """Whether the prediction of this sample is one: all regressors were known, and span their directions.
 
     A prediction of infinite variance carries no information (a diffuse start) and must not become a lag.
     """
-    y, y_hat, filled, observed = s.y[l], s.y_hat[l], s.filled[l], s.observed[l] > 0.0
-    known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
+    return (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))  # type: ignore[no-any-return]
+
+
+@kernel
+def take_output(s: State, na: int, o: int, lane: int, l: int) -> None:
+    """Output o, of this lane, is its first lag; where it is missing its prediction, for na samples in a row."""
+    y, y_hat, filled, observed = s.y[lane], s.y_hat[lane], s.filled[o, l], s.observed[lane] > 0.0
+    known = informed(s, lane) & (filled < na)
     fill = y_hat if known else np.nan
-    s.filled[l] = 0.0 if observed else filled + 1.0
+    s.filled[o, l] = 0.0 if observed else filled + 1.0
     if na > 0:
-        s.y_lag[0, l] = y if observed else fill
+        s.y_lag[o, 0, l] = y if observed else fill
 
 
 def no_doubts(ny: int, na: int) -> Mapping[str, Any]:

@@ -46,12 +46,6 @@ def subtract(s: State, shift: float, complete: bool, l: int) -> None:
 
 
 @kernel
-def informed(s: State, l: int) -> bool:
-    """Whether the prediction of this sample is one: all regressors were known, and span their directions."""
-    return (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))  # type: ignore[no-any-return]
-
-
-@kernel
 def restore(s: State, observed: bool, l: int) -> None:
     """The prediction becomes one of y, and the sample is counted.
 

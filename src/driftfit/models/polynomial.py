@@ -30,7 +30,7 @@ the gradient with respect to F is 0 at theta = 0, and e means nothing before A a
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
 autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at
 1 - 4 n / N of their distance from 0. The bias of the start fades with the memory of the tracker; `RLS`, also with
-lambda = 1, has a short one during the first 80 n samples, without C and D 40 n (`Model.settling`).
+lambda = 1, has a short one during the first 80 n samples, without C and D 40 n (`Linearised.settling`).
 
 A missing output is replaced by its prediction, for at most na outputs in a row if there are lags of it, and its e is
 0. A missing input makes the samples unusable that have it in psi directly; in w its last value is held. A gap in time
@@ -52,7 +52,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import whole
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
@@ -92,7 +92,7 @@ def hold_before(s: State, signal: int, age: int, l: int) -> None:
 
 @lru_cache
 def taking_late(take_inputs: Step) -> Step:
-    """`Model.apply`: where a record takes the inputs in, their sample has not been counted yet."""
+    """`ModelSteps.apply`: where a record takes the inputs in, their sample has not been counted yet."""
 
     @kernel
     def take_late(s: State, l: int) -> None:
@@ -105,8 +105,8 @@ def taking_late(take_inputs: Step) -> Step:
 
 
 @lru_cache
-def refusing(p: Places) -> Any:
-    """`Model.refuse`: the input before is held, and the response w since then is without that to the difference."""
+def _refusing(p: Places) -> Any:
+    """`ModelSteps.refuse`: the input before is held, and w since then is without the response to the difference."""
     n, m, nb, nf, nk, at_b, at_f = p.n, p.m, p.nb, p.nf, p.nk, p.at_b, p.at_f
 
     @kernel
@@ -133,6 +133,13 @@ def refusing(p: Places) -> Any:
                 subtract_response(s, j, age, l)
 
     return refuse
+
+
+@lru_cache
+def _steps(p: Places, held: bool, instruments: bool = False) -> ModelSteps:
+    made = instrumental_steps(p, held) if instruments else steps(p, held)
+    late, ages = all(p.nk[: p.m]), max((nb + nk - 1 for nb, nk in zip(p.nb[: p.m], p.nk, strict=False)), default=0)
+    return made._replace(apply=taking_late(taking_inputs(p)) if late else None, ages=ages, refuse=_refusing(p))
 
 
 @dataclass(frozen=True)
@@ -247,16 +254,8 @@ class PolynomialModel(LinearisedTransfer):
         }
 
     @property
-    def input_memory(self) -> int:
-        return max((nb + nk - 1 for nb, _, nk in self.orders), default=0)
-
-    @property
-    def refuse(self) -> Any:
-        return refusing(self._places)
-
-    @property
     def steps(self) -> ModelSteps:
-        return steps(self._places, self.point is not None)
+        return _steps(self._places, self.point is not None)
 
     @property
     def instruments(self) -> bool:
@@ -266,23 +265,13 @@ class PolynomialModel(LinearisedTransfer):
     def simulated(self) -> tuple[bool, ...]:
         return tuple(nf > 0 for _, nf, _ in self.orders)
 
-    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
+    def fitted_to(self, tracker: TrackerSteps) -> tuple[Mapping[str, Any], ModelSteps]:
         memory = self.memory()
         if not (tracker.instruments and self.instruments):
-            return memory
-        rows = np.zeros((len(memory["signals"]) + MORE * self.m, self._depth))
-        rows[: len(memory["signals"])] = memory["signals"]
-        return {**memory, "signals": rows, "followed": memory["point"]}
-
-    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
-        if not (tracker.instruments and self.instruments):
-            return self.steps
-        return instrumental_steps(self._places, self.point is not None)
-
-    @property
-    def apply(self) -> Step | None:
-        late = all(nk > 0 for _, _, nk in self.orders)
-        return taking_late(taking_inputs(self._places)) if late else None
+            return memory, self.steps
+        rows = np.concatenate([memory["signals"], np.zeros((MORE * self.m, self._depth))])
+        memory = {**memory, "signals": rows, "followed": memory["point"]}
+        return memory, _steps(self._places, self.point is not None, True)
 
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of C / (A D) to an impulse, (h,)."""
@@ -293,34 +282,36 @@ class PolynomialModel(LinearisedTransfer):
         return response
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-        theta = np.asarray(theta, dtype=float)
-        p, one = self._places, np.ones((*theta.shape[:-1], 1))
-        A = whole = np.concatenate([one, -theta[..., : self.na]], axis=-1)
+        parts = self.parts(theta)
+        A = whole = parts["A"]
         found = []
-        for j, (nb, nf, nk) in enumerate(self.orders):
-            delay = np.zeros((*theta.shape[:-1], nk))
-            B = np.concatenate([delay, theta[..., p.at_b[j] : p.at_b[j] + nb]], axis=-1)
-            F = np.concatenate([one, -theta[..., p.at_f[j] : p.at_f[j] + nf]], axis=-1)
+        for B, F in zip(parts["B"], parts["F"], strict=True):
             whole = _product(whole, F)
             found.append((B, _product(A, F)))
         return whole, found
 
     def parts(self, theta: Array) -> dict[str, Any]:
-        """The polynomials of one theta (n,) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
+        """The polynomials of theta (.., n) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
 
         They have the signs of the equation, so that A = [1, -a_1, ..]; B begins with nk zeros.
         """
         theta = np.asarray(theta, dtype=float)
         sizes = [self.na, *(nb for nb, _, _ in self.orders), self.nc, self.nd, *(nf for _, nf, _ in self.orders)]
-        cut = np.split(theta[: sum(sizes)], np.cumsum(sizes)[:-1])
-        b, (c, d), f = cut[1 : 1 + self.m], cut[1 + self.m : 3 + self.m], cut[3 + self.m :]
+        a, *cut = np.split(theta[..., : sum(sizes)], np.cumsum(sizes)[:-1], axis=-1)
+        b, (c, d), f = cut[: self.m], cut[self.m : 2 + self.m], cut[2 + self.m :]
+        zeros = [np.zeros((*theta.shape[:-1], nk)) for _, _, nk in self.orders]
         return {
-            "A": np.append(1.0, -cut[0]),
-            "B": [np.append(np.zeros(nk), one) for one, (_, _, nk) in zip(b, self.orders, strict=True)],
-            "C": np.append(1.0, c),
-            "D": np.append(1.0, -d),
-            "F": [np.append(1.0, -one) for one in f],
+            "A": _monic(-a),
+            "B": [np.concatenate([late, one], axis=-1) for late, one in zip(zeros, b, strict=True)],
+            "C": _monic(c),
+            "D": _monic(-d),
+            "F": [_monic(-one) for one in f],
         }
+
+
+def _monic(rest: Array) -> Array:
+    """The polynomial 1 + rest_1 z^-1 + .., coefficients on the last axis."""
+    return np.concatenate([np.ones((*rest.shape[:-1], 1)), rest], axis=-1)
 
 
 def _product(one: Array, other: Array) -> Array:

@@ -36,9 +36,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, kernel
-from driftfit.models.formula import Formula, Writer, parse, start_values, written
+from driftfit.engine.kernel import State, kernel
+from driftfit.models.formula import Formula, Writer, complete_with, parse, start_values, written
 from driftfit.models.inputs import NamedInputs
+from driftfit.models.lags import take_output
 
 TIME, CLOCK = "dt", "clock"
 
@@ -139,39 +140,20 @@ class StateSpace(NamedInputs):
         return (self.system.output,)
 
     @property
-    def begins(self) -> Array:
-        """Parameters and states (n,) before the first sample."""
-        if not isinstance(self.start, tuple):
-            return np.full(self.n, float(self.start))
-        given = dict(self.start)
-        return np.array([given.get(name, float(name not in self.hidden)) for name in self.names])
-
-    @property
-    def input_memory(self) -> int:
-        return self.system.reach
-
-    @property
-    def refuse(self) -> Any:
-        return forget_input
+    def remembers_outputs(self) -> bool:
+        return any(name == self.system.output for line in self.system.lines for name, _ in line.lags)
 
     def memory(self) -> Mapping[str, Any]:
         depth, n = self.system.reach + 1, self.n
         return {
-            "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
+            "y_lag": np.full((1, depth), np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
-            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0,
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "filled": np.zeros(1), "clock": -1.0,
         }  # fmt: skip
 
     @property
     def steps(self) -> ModelSteps:
         return _steps(self.equations, self.input_names)
-
-    def noise_response(self, theta: Array, h: int) -> Array:
-        """1, then 0 without lags of the output; with them it depends on the operating point and is NaN."""
-        response: Array = np.eye(1, h)[0]
-        if any(name == self.system.output for line in self.system.lines for name, _ in line.lags):
-            response[1:] = np.nan
-        return response
 
 
 class _StateWriter(Writer):
@@ -240,28 +222,28 @@ def equations_of(text: str, inputs: tuple[str, ...]) -> Equations:
 
 @kernel
 def forget_input(s: State, signal: int, age: int, l: int) -> None:
-    """`Model.refuse`."""
+    """`ModelSteps.refuse`."""
     s.u_known[signal, age, l] = 0.0
+
+
+@kernel
+def known_input(s: State, j: int, lag: int, l: int) -> bool:
+    """Whether input j was known that many samples ago, and not held from before."""
+    return s.u_known[j, lag, l] > 0.0  # type: ignore[no-any-return]
 
 
 @lru_cache
 def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
     """Lags, and whether a sample has all its inputs. What the equations say of it is the tracker's work."""
     system = system_of(equations)
-    m, n, reach, output = len(inputs), len(system.parameters) + len(system.hidden), system.reach, system.output
-    used = sorted({
-        (inputs.index(name), lag) for line in system.lines for name, lag in line.lags if name in inputs
-    })  # fmt: skip
-    lags = sorted({lag for line in system.lines for name, lag in line.lags if name == output})
-    of_input, with_lag = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,)
-    own = tuple(lags) or (0,)
-    count, owned = len(used), len(lags)
+    m, n, reach = len(inputs), len(system.parameters) + len(system.hidden), system.reach
+    complete_at = complete_with(known_input, system.lines, inputs, system.output)
 
     @kernel
     def regress(s: State, l: int) -> None:
         s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
-            s.y_lag[i, l] = s.y_lag[i - 1, l]
+            s.y_lag[0, i, l] = s.y_lag[0, i - 1, l]
             for j in range(m):
                 s.u_lag[j, i, l] = s.u_lag[j, i - 1, l]
                 s.u_known[j, i, l] = s.u_known[j, i - 1, l]
@@ -269,19 +251,12 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
             known = abs(s.u[j, l]) < LARGEST
             s.u_known[j, 0, l] = 1.0 if known else 0.0
             s.u_lag[j, 0, l] = s.u[j, l] if known else s.u_lag[j, min(1, reach), l]
-        complete = True
-        for k in range(count):
-            complete = complete & (s.u_known[of_input[k], with_lag[k], l] > 0.0)
-        for k in range(owned):
-            complete = complete & (abs(s.y_lag[own[k], l]) < LARGEST)
+        complete = complete_at(s, l)
         for i in range(n):
             s.phi[i, l] = 1.0 if complete else np.nan
 
     @kernel
     def push(s: State, l: int) -> None:
-        observed = s.observed[l] > 0.0
-        known = (s.valid[l] > 0.0) & (s.without[l] < reach)
-        s.without[l] = 0.0 if observed else s.without[l] + 1.0
-        s.y_lag[0, l] = s.y[l] if observed else (s.y_hat[l] if known else np.nan)
+        take_output(s, reach, 0, l, l)
 
-    return ModelSteps(regress, push)
+    return ModelSteps(regress, push, ages=reach, refuse=forget_input)

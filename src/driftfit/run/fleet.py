@@ -288,7 +288,9 @@ class Outputs(KeyedResults, OfRecord):
         if alone is None:
             found, names = self._collected, self.names[j]
             alone, known = Program(Regression(names), self.trackers[j]), known.changed(interval=found["dt"][:, j])
-            held = zip(names, self.model.sources, strict=True)
+            signals = {("y", k): name for k, name in enumerate(self.outputs)}
+            signals |= {("u", k): name for k, name in enumerate(self.labels.u)}
+            held = [(name, signals.get(term[:2])) for name, term in zip(names, self.model.terms or (), strict=False)]
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:

@@ -102,8 +102,8 @@ class Program:
 
     @cached_property
     def settling(self) -> float:
-        """`Model.settling` of the whole model."""
-        return self.whole.settling
+        """`Linearised.settling` of the whole model, or 0."""
+        return 0.0 if self.whole.linearised is None else self.whole.linearised.settling
 
     @cached_property
     def inspects(self) -> bool:
@@ -137,7 +137,7 @@ class Program:
         if self.output is None:
             return self.tracker_start
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory_for(self.steps), **self.tracker_start}
+        return {**own.fitted_to(self.steps)[0], **self.tracker_start}
 
     @cached_property
     def tracker_start(self) -> State:
@@ -224,13 +224,14 @@ class Program:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         found = self._drivers.get((keep, steps))
         if found is None:
-            model, own, gate = self.model, self.steps if steps is None else steps, None
-            if self.gate is not None:
-                ages, refuse, lends = model.input_memory, model.refuse, not self.tracker.covariance
-                foresee = None if self.tracker.output_error else foreseeing(model.steps_for(self.steps), own)
-                gate = gate_step(self.gate, model.n, model.m, ages, refuse, model.implicit, lends, foresee)
-            found = drivers(model.steps_for(self.steps), own, keep, gate)
-            if gate is not None:
+            model, own = self.model.fitted_to(self.steps)[1], self.steps if steps is None else steps
+            if self.gate is None:
+                found = drivers(model, own, keep)
+            else:
+                foresee = None if self.tracker.output_error else foreseeing(model, own)
+                implicit, lends = self.model.implicit is not None, not self.tracker.covariance
+                given = self.model.n, self.model.m, model.ages, model.refuse, implicit, lends
+                found = drivers(model, own, keep, gate_step(self.gate, *given, foresee))
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
         return found
@@ -273,7 +274,8 @@ class Program:
     @property
     def width(self) -> int:
         """The number of lanes of a tile of many series, or of many settings."""
-        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else min(self.model.width, self.tracker.width)
+        most = min(self.model.steps.width, self.tracker.width)
+        return 1 if self.model.n > WIDEST_LANES or self.gate is not None else most
 
     def lanes(self, count: int) -> Array:
         """A tile with this program in every lane, at its start. It is made once and must not be changed."""
@@ -308,9 +310,8 @@ class Program:
         return np.empty(T, output_type(tile, tuple(dict.fromkeys((*(GATED if self.gate else ()), *fields))), keep))
 
     def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
-        """(the routine that runs tiles like this one, an array for the results of T samples).
-
-        With ``collected`` it stores every sample as the tracker receives it, in double precision.
+        """(the routine that runs tiles like this one, an array for the results of T samples); with ``collected`` it
+        stores every sample as the tracker receives it, in double precision.
         """
         if not collected:
             return self.fill, self.written(tile, T, keep, dtype)
@@ -396,10 +397,9 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
 
 
 def _started(programs: Sequence[Program]) -> Array:
-    model = programs[0].model
+    model, tracker = programs[0].model, programs[0].tracker
     starts = {one: one.start for one in programs}
-    memory = model.memory_for(programs[0].steps)
-    tracker = programs[0].tracker
+    memory, _ = model.fitted_to(programs[0].steps)
     if both := sorted((set(memory) & set(programs[0].tracker_start)) - set(tracker.replaces)):
         raise ValueError(
             f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "

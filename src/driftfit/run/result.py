@@ -216,7 +216,7 @@ class Track(Plain, OfRecord):
                 terms = -0.5 * (np.log(2.0 * np.pi * s) + e**2 / s)
         terms = np.where(counted, terms, np.nan)
         if self.model.implicit and not self.tracker.output_error:
-            terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
+            terms[counted] += self.model.implicit.log_jacobian(self.theta[counted], self.y[counted])
         return terms
 
     def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
@@ -268,7 +268,7 @@ class Track(Plain, OfRecord):
         """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
             return self._left_out
-        used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.input_memory
+        used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.steps.ages
         return left_out_of(self.in_rows("reason"), self.record.y, used, ages, self.program.signals)
 
     @cached_property

@@ -271,7 +271,7 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
     for run in runs:
         for name, values in {} if run.program.gate else _codes(run).items():
             found[name] += values
-            linear &= run.model.hidden is None and not (run.model.implicit or run.model.settling)
+            linear &= run.model.hidden is None and not (run.model.implicit or run.program.settling)
     if found:
         warn(f"{verb}: {ungated(found, linear)}")
 
@@ -285,7 +285,7 @@ def _codes(run: Track) -> dict[str, list[float]]:
     left, found = track_record(replace(run.program, gate=Gate()), run.record).left_out, {}
     names, labels = run.program.signals, (run.labels.y, *(run.labels.u or run.program.signals[1:]))
     for name, label, signal, places in zip(names, labels, signals, far, strict=True):
-        ages = 0 if name == names[0] else run.program.model.input_memory
+        ages = 0 if name == names[0] else run.program.model.steps.ages
         blamed = left.sample[left.signal == name][:, None] - np.arange(ages + 1)
         found[label] = signal[np.intersect1d(blamed, places)].tolist()
     return {label: values for label, values in found.items() if values}

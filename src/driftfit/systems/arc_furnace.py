@@ -33,7 +33,8 @@ SUPPLY, RESISTANCE, REACTANCE, DROP = 320.0, 0.4, 0.7, 30.0
 VOLTAGE = 10.0
 """The valve takes no more, either way: the limits of equation (61)."""
 WORKING_POINT = 20.0
-SHORTEST, LONGEST = 2.0, 45.0
+ARC_LENGTHS = 2.0, 45.0
+"""The shortest and the longest arc, cm, of a record that is kept."""
 
 
 class Furnace(NamedTuple):
@@ -88,7 +89,7 @@ def furnace(seed: int = 0, T: int = 5000, reach: float = 3.0) -> Furnace:
             drive = B[0] * past[t + 2] + B[1] * past[t + 1] + B[2] * past[t]
             w.append(drive - A[0] * w[-1] - A[1] * w[-2] - A[2] * w[-3])
         L = WORKING_POINT + np.array(w[3:])
-        if L.min() > SHORTEST and L.max() < LONGEST:
+        if ARC_LENGTHS[0] < L.min() and L.max() < ARC_LENGTHS[1]:
             return Furnace(u, resistance(L, gradient), L, gradient, v)
         seed += 1000
 

@@ -123,8 +123,8 @@ class Tracker(Settings, ABC):
         return self.steps
 
     def apply_for(self, model: Model) -> Step | None:
-        """The step that stores an input after its sample (`Model.apply`), for a bound model."""
-        return model.apply
+        """The step that stores an input after its sample (`ModelSteps.apply`), for a bound model."""
+        return model.steps.apply
 
     def names_for(self, model: Model) -> tuple[str, ...]:
         """Names of the entries of theta."""

@@ -53,7 +53,7 @@ NODES, WEIGHTS = tuple((np.sqrt(2.0) * _NODES).tolist()), tuple((_WEIGHTS / np.s
 STEPS, CLOSE = 60, 1e-10
 """Newton steps at most, and the share of a standard deviation at which they end."""
 
-HIGHEST = 40.0
+LARGEST_ETA = 40.0
 """Largest eta, and the largest variance of it in a forecast: e^40 is 2e17."""
 
 HALF_LOG_2_PI = 0.9189385332046727
@@ -165,8 +165,8 @@ def forecast(family: int, m: float, v: float, alpha: float) -> tuple[float, floa
             mean += WEIGHTS[k] * mu
             square += WEIGHTS[k] * mu * mu
         return mean, mean - square, max(square - mean * mean, 0.0)
-    wide = min(v, HIGHEST)
-    mean = exp(min(m + 0.5 * wide, HIGHEST))
+    wide = min(v, LARGEST_ETA)
+    mean = exp(min(m + 0.5 * wide, LARGEST_ETA))
     square = mean * mean * exp(wide)
     return mean, mean + (alpha * square if family == NEGATIVE else 0.0), square - mean * mean
 
@@ -179,7 +179,7 @@ def forecast_output(s: State, l: int) -> None:
     if family == GAUSSIAN:
         y_hat, own, of_mean = m, 1.0, v
     else:
-        y_hat, own, of_mean = forecast(family, min(max(m, -HIGHEST), HIGHEST), v, s.alpha[l])
+        y_hat, own, of_mean = forecast(family, min(max(m, -LARGEST_ETA), LARGEST_ETA), v, s.alpha[l])
     s.y_hat[l], s.e[l], s.h[l], s.dispersed[l] = y_hat, s.y[l] - y_hat, of_mean, own
 
 
@@ -196,7 +196,7 @@ def correct(s: State, l: int) -> None:
         after, left = m + v * (y - m) / variance, v * r / variance
         density = -HALF_LOG_2_PI - 0.5 * (log(variance) + (y - m) * (y - m) / variance)
     else:
-        held = min(max(m, -HIGHEST), HIGHEST)
+        held = min(max(m, -LARGEST_ETA), LARGEST_ETA)
         after, left, density = m, v, 0.0
         possible = (y >= 0.0) & ((family != LOGISTIC) | (y <= 1.0))
         s.ok[l] = s.ok[l] if possible else 0.0

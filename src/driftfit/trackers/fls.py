@@ -42,16 +42,7 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.forms import second_differences
 from driftfit.trackers.forms.covariance import correct as measure
 from driftfit.trackers.forms.covariance import forecast, read_drift
-from driftfit.trackers.forms.diffuse import (
-    SCRATCH,
-    correct_on_roots,
-    drifted,
-    forecast_on_roots,
-    knowing,
-    knowing_nothing,
-    spanned_variance,
-    started,
-)
+from driftfit.trackers.forms.diffuse import SCRATCH, before_any_sample, correct_on_roots, drifted, started
 from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.rls import learn_scale, no_scale
 
@@ -159,7 +150,7 @@ class FLS(Tracker):
             "drift_root": np.ones(n),
             "begun": 0.0,
             **no_scale(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **before_any_sample(n, self.p0),
         }
 
     @property
@@ -191,5 +182,6 @@ class FLS(Tracker):
 
 STEPS = started(
     TrackerSteps(drift, forecast, correct, read_extra=read_drift, learns_scale=True),
-    TrackerSteps(drift_root_form, forecast_on_roots, correct_root_form, spanned_variance),
+    drift_root_form,
+    correct_root_form,
 )

@@ -69,10 +69,10 @@ LEAST_SQUARES = 10.0
 FORGOTTEN = 40.0
 """Samples for each parameter until which these are forgotten again."""
 
-LEAST = 0.5
+SMALLEST_PRODUCT_SHARE = 0.5
 """Least share of its noise variance that 1 / w + phi' G zeta may be."""
 
-MOST = 1e6
+LARGEST_PRODUCT_RATIO = 1e6
 """The most that it may be beside 1 / w + zeta' C zeta, with refined instruments."""
 
 
@@ -128,10 +128,10 @@ def learning(refined: bool) -> Step:
         n, noise, e = s.theta.shape[0], s.noise[l], s.e[l]
         v = s.h[l] + noise
         common = noise + weigh_instruments(s, l)
-        if refined and not abs(common) < MOST * v:
+        if refined and not abs(common) < LARGEST_PRODUCT_RATIO * v:
             symmetric(s, l)
             common = noise + weigh_instruments(s, l)
-        learned = (s.ok[l] > 0.0) & (common >= LEAST * noise) & (common < LARGEST) & (v < LARGEST)
+        learned = (s.ok[l] > 0.0) & (common >= SMALLEST_PRODUCT_SHARE * noise) & (common < LARGEST) & (v < LARGEST)
         gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
         along = 1.0 / v if learned else 0.0
         for i in range(n):
@@ -215,6 +215,11 @@ def steps(refined: bool) -> TrackerSteps:
     )
 
 
+def _written_by(model: Model) -> bool:
+    """Whether the model has instruments of its own."""
+    return model.linearised is not None and model.linearised.instruments
+
+
 @dataclass(frozen=True)
 class InstrumentalVariables(Forgetting):
     """Recursive instrumental variables for models in coloured noise, with an auxiliary model and forgetting.
@@ -267,7 +272,7 @@ class InstrumentalVariables(Forgetting):
         return steps(False)
 
     def steps_for(self, model: Model) -> TrackerSteps:
-        if model.instruments:
+        if _written_by(model):
             return steps(True)
         if model.output_lags is None:
             raise ValueError(
@@ -278,7 +283,7 @@ class InstrumentalVariables(Forgetting):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         own = {**super().state_for(model), "output_lags": model.output_lags or 0}
-        if self.p0 is None and model.output_lags and not model.instruments:
+        if self.p0 is None and model.output_lags and not _written_by(model):
             own |= {"discounted": FORGOTTEN * model.n, "first_memory": LEAST_SQUARES * model.n}
         return own
 

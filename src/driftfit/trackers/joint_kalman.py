@@ -19,7 +19,7 @@ filters are only as good as these numbers: look at ``run.diagnose()``, and compa
 
 Where equations
 have no finite value at the estimate, or at a point of the unscented filter, the states stay and the sample is not used.
-A gap of several nominal samples repeats equations that do not use dt, at most `MOST` times.
+A gap of several nominal samples repeats equations that do not use dt, at most `REPEAT_LIMIT` times.
 
 Source: Jazwinski, Stochastic Processes and Filtering Theory (1970), theorem 8.1; Julier and Uhlmann, Unscented
 filtering and nonlinear estimation, Proc. IEEE 92 (2004); Arasaratnam and Haykin, Cubature Kalman filters, IEEE Trans.
@@ -44,7 +44,7 @@ from driftfit.trackers.forms.covariance import correct, read_drift, symmetric_pr
 from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
-MOST = 1000.0
+REPEAT_LIMIT = 1000.0
 """Times that equations are repeated for one gap, at most."""
 
 KNOWN = 1e-14
@@ -72,7 +72,7 @@ def _repeated(move: Step, timed: bool) -> Step:
 
     @kernel
     def predict(s: State, l: int) -> None:
-        left = 1.0 if timed else min(max(1.0, s.dt[l]), MOST)
+        left = 1.0 if timed else min(max(1.0, s.dt[l]), REPEAT_LIMIT)
         left = left if s.dt[l] > 0.0 else 0.0
         while left > 0.5:
             move(s, l)

@@ -41,16 +41,7 @@ from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.forms import square_root
 from driftfit.trackers.forms.covariance import correct, forecast, read_drift
-from driftfit.trackers.forms.diffuse import (
-    SCRATCH,
-    correct_on_roots,
-    drifted,
-    forecast_on_roots,
-    knowing,
-    knowing_nothing,
-    spanned_variance,
-    started,
-)
+from driftfit.trackers.forms.diffuse import SCRATCH, before_any_sample, drifted, started
 from driftfit.trackers.forms.information import partly_known, triangular_root
 from driftfit.trackers.forms.volatility import FIELDS, known_noise, log_density, smoothed_noise, volatile
 from driftfit.trackers.laws import filter as laws_filter
@@ -79,9 +70,8 @@ def drift_root_form(s: State, l: int) -> None:
     drifted(s, s.dt[l] * s.drift[l], l)
 
 
-START = TrackerSteps(drift_root_form, forecast_on_roots, correct_on_roots, spanned_variance)
-INDEPENDENT = started(TrackerSteps(drift, forecast, correct, read_extra=read_drift), START)
-TOGETHER = started(TrackerSteps(drift_matrix, forecast, correct, read_extra=read_drift), START)
+INDEPENDENT = started(TrackerSteps(drift, forecast, correct, read_extra=read_drift), drift_root_form)
+TOGETHER = started(TrackerSteps(drift_matrix, forecast, correct, read_extra=read_drift), drift_root_form)
 
 
 @dataclass(frozen=True)
@@ -186,7 +176,7 @@ class Kalman(Tracker):
             "g": np.zeros(n),
             "drift_root": np.ones(n),
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **before_any_sample(n, self.p0),
             **(self._root(n) if self.form == "sqrt" else {}),
             **self._noise(),
         }

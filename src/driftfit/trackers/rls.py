@@ -13,7 +13,7 @@ forgetting would let P grow without bound. It stops when a variance is ``c_max``
 regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
 A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
-`Model.settling` the memory is at most `Model.settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
+`Linearised.settling` the memory is at most `settling_memory` samples or k / 4, if that is more: the lambda(t) -> 1 of
 Ljung and Soderstrom (1983), section 5.6. If the model has one of the noise, P is in units of the least variance of e so
 far, of max(20, k / 8) samples: those before the noise was known have large innovations, and would outweigh all later
 ones. The least of many estimates is too small for a noise variance, which is instead the mean of e^2 / s over the last
@@ -51,13 +51,11 @@ from driftfit.trackers.forms.covariance import forecast
 from driftfit.trackers.forms.diffuse import (
     SCRATCH,
     absorb_on_roots,
+    before_any_sample,
     correct_on_roots,
     forecast_on_roots,
     hand_over,
-    knowing,
-    knowing_nothing,
     reform,
-    spanned_variance,
     started,
     wander,
 )
@@ -78,8 +76,11 @@ def no_settling() -> dict[str, Any]:
 
 def settling_of(model: Model) -> dict[str, Any]:
     """Those that a model gives."""
-    N = model.settling
-    return {"discounted": N, "first_memory": model.settling_memory, "unequal": N if model.unequal_start else 0.0}
+    one = model.linearised
+    if one is None:
+        return {}
+    N = one.settling
+    return {"discounted": N, "first_memory": one.settling_memory, "unequal": N if one.unequal_start else 0.0}
 
 
 @kernel
@@ -251,13 +252,12 @@ def correct_direction_root_form(s: State, l: int) -> None:
     hand_over(s, l)
 
 
-EXPONENTIAL = started(
-    TrackerSteps(forget, forecast, correct, learns_scale=True),
-    TrackerSteps(forget_root_form, forecast_on_roots, correct_root_form, spanned_variance),
-)
+EXPONENTIAL = started(TrackerSteps(forget, forecast, correct, learns_scale=True), forget_root_form, correct_root_form)
 DIRECTIONAL = started(
     TrackerSteps(nothing, forecast, correct_direction, learns_scale=True),
-    TrackerSteps(nothing, forecast_direction, correct_direction_root_form, spanned_variance),
+    nothing,
+    correct_direction_root_form,
+    forecast_direction,
 )
 
 
@@ -300,7 +300,7 @@ class Forgetting(Tracker):
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_settling(),
             **no_scale(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **before_any_sample(n, self.p0),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:

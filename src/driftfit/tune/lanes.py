@@ -151,7 +151,7 @@ class _Sums:
         counted = self._likelihood(out, ok)
         self._forecast(a, out, ok, y)
         if self.model.implicit and not self.tracker.output_error:
-            terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
+            terms = self.model.implicit.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
         root = np.reshape(np.sqrt(self.record.known.part(slice(a, a + len(out))).noise), (-1, 1, 1))
         self.powers += np.sum(np.where(ok[:, None], out["phi"] / root, 0.0) ** 2, axis=0)

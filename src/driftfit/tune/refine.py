@@ -1,7 +1,7 @@
 """Estimation off line: the record is run again and again, each time linearised at the last estimate of the run before.
 
 A model whose prediction is not linear in theta (`PolynomialModel`, `ContinuousTransfer`) is linearised on line at an
-estimate that is poor at first. With the linearisation held at theta' for a whole record (`Model.held_at`), it is a
+estimate that is poor at first. With the linearisation held at theta' for a whole record (`Linearised.held_at`), it is a
 linear regression, and the record is run until the estimate settles:
 
     theta'  <-  the estimate of the run that is linearised at theta',   until it moves by less than a share of its std
@@ -87,13 +87,15 @@ def refine(run: R, passes: int = 20, drifting: bool = False) -> R:
 
 def _at(run: R, point: Array, tracker: Tracker | None = None) -> R:
     """The run linearised at a point."""
-    model = run.program.model.held_at(point)
-    if model is None:
+    linearised = run.program.model.linearised
+    if linearised is None:
         raise ValueError(
             f"refine: {type(run.model).__name__} is not linearised, so there is nothing to refine; it is for OE, "
             "ARMAX, BoxJenkins, PolynomialModel and ContinuousTransfer."
         )
-    return run.run_by(replace(run.program, model=model, tracker=run.tracker if tracker is None else tracker))
+    return run.run_by(
+        replace(run.program, model=linearised.held_at(point), tracker=run.tracker if tracker is None else tracker)
+    )
 
 
 def _downhill(run: Track, point: Array, goal: Array) -> Array | None:

@@ -240,9 +240,10 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
         return replace(result, y_std=np.sqrt(result.y_std))
     if begin is not None:
         return replace(result, y_std=_spread_of_draws(update, begin, inputs, result.y_hat))
-    noise *= model.noise_factor(now, result.y_hat[0])
-    later = _fed_back(model, now, slopes, covs, float(noise))
-    return replace(result, y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
+    curved = model.implicit
+    noise *= 1.0 if curved is None else curved.noise_factor(now, result.y_hat[0])
+    y_std = np.sqrt(result.y_std + _fed_back(model, now, slopes, covs, float(noise)))
+    return replace(result, y_std=y_std if curved is None else y_std / curved.output_slope(now, result.y_hat))
 
 
 def _spread_of_draws(update: Any, begin: Array, inputs: Array, y_hat: Array) -> Array:

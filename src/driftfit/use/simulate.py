@@ -358,7 +358,7 @@ def systems(run: Track, theta: Array) -> Array:
     """Parameters of the regression (.., n) from those of the tracker."""
     if run.names == run.model.names:
         return theta
-    found = run.model.expand(theta)
+    found = None if run.model.implicit is None else run.model.implicit.expand(theta)
     if found is None:
         raise ValueError(
             f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which do not define a system."

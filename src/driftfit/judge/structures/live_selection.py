@@ -106,7 +106,7 @@ class LiveSelection(Kept):
         *_, ok = self.reference.update(y, u, **known)
         reason = int(self.reference.lane()["reason"])
         if reason % SIGNAL == INPUT:
-            self._blamed = self.reference.model.input_memory + 1
+            self._blamed = self.reference.model.steps.ages + 1
         unused = self._blamed > 0 and not ok
         self._blamed = max(self._blamed - 1, 0)
         return (np.nan if reason in (REFUSED, FROZEN) else y), {**known, "weight": 0.0} if unused else known
@@ -123,7 +123,7 @@ class LiveSelection(Kept):
         else:
             found = -0.5 * (np.log(2.0 * np.pi * s) + e * e / s)
         if live.model.implicit and not live.tracker.output_error:
-            found += live.model.log_jacobian(live.theta[None], np.array([y]))[0]
+            found += live.model.implicit.log_jacobian(live.theta[None], np.array([y]))[0]
         return float(found)
 
     @property

@@ -16,7 +16,7 @@ drift differs at random between structures, and would hide a superfluous paramet
   columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures run
   in parallel as lanes of one compiled driver, as wide as the largest of them. Other models, such as
   Hammerstein-Wiener, run one by one, in one driver for all orders of the same bases; a model whose regressors contain
-  the present output supplies its Jacobian (``log_jacobian``).
+  the present output supplies its Jacobian (`Implicit`).
 * `select(model, y, u)` with one model searches for the best subset of its regressors: all subsets of up to 5
   regressors, and from there to 30 a search that adds the best and drops the worst, with p runs per round instead of
   2^p in all.

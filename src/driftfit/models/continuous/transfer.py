@@ -41,14 +41,14 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
-from driftfit.engine.kernel import Array, Step
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
-from driftfit.models.continuous.filters import STIFF, Orders, late_inputs, refusing, steps
+from driftfit.models.continuous.filters import STIFF, Orders, steps
 from driftfit.models.continuous.sampling import sampled
 from driftfit.models.inputs import LinearisedTransfer
 from driftfit.models.linearised import MEMORY
 
-HIGHEST = 4
+POLE_LIMIT = 4
 """The largest number of poles."""
 
 FORGOTTEN, TIMES = 40.0, 100.0
@@ -105,9 +105,9 @@ class ContinuousTransfer(LinearisedTransfer):
         kind = "ContinuousTransfer"
         for name, low in (("poles", 1), ("zeros", 0), ("delay", 0)):
             self._set(name, whole(kind, name, getattr(self, name), low))
-        if self.poles > HIGHEST or self.zeros >= self.poles:
+        if self.poles > POLE_LIMIT or self.zeros >= self.poles:
             raise ValueError(
-                f"{kind}: poles must be 1 to {HIGHEST}, and zeros fewer than poles; got poles={self.poles!r}, "
+                f"{kind}: poles must be 1 to {POLE_LIMIT}, and zeros fewer than poles; got poles={self.poles!r}, "
                 f"zeros={self.zeros!r}."
             )
         for name in ("dt", "cutoff"):
@@ -154,8 +154,8 @@ class ContinuousTransfer(LinearisedTransfer):
         """Its equation has no past outputs."""
         return 0
 
-    def _orders(self, instruments: bool) -> Orders:
-        return Orders(self.poles, self.zeros, self.m, self.offset, self.delay, self.point is not None, instruments)
+    def _steps(self, instruments: bool) -> ModelSteps:
+        return steps(Orders(self.zeros, self.offset, self.point is not None, instruments), self.delay)
 
     def memory(self) -> Mapping[str, Any]:
         n, known = self.poles, self.first_point if self.point is None else np.array(self.point)
@@ -175,23 +175,11 @@ class ContinuousTransfer(LinearisedTransfer):
         }  # fmt: skip
 
     @property
-    def input_memory(self) -> int:
-        return self.delay + 1
-
-    @property
-    def refuse(self) -> Any:
-        return refusing(self._orders(False))
-
-    @property
     def steps(self) -> ModelSteps:
-        return steps(self._orders(False))
+        return self._steps(False)
 
-    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
-        return steps(self._orders(tracker.instruments))
-
-    @property
-    def apply(self) -> Step | None:
-        return late_inputs(self._orders(False))
+    def fitted_to(self, tracker: TrackerSteps) -> tuple[Mapping[str, Any], ModelSteps]:
+        return self.memory(), self._steps(tracker.instruments)
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         """As every model in powers of z^-1: those of the system sampled at nominal times."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from inspect import isabstract
 from itertools import pairwise
@@ -64,6 +64,8 @@ class Basis(Settings, ABC):
 
     code: ClassVar[int] = -1
     """The kind, as a code of `driftfit.models.hammerstein_wiener.curve_kernels`."""
+    sequence: ClassVar[tuple[int, str] | None] = None
+    """How many numbers come before those of a setting that is a sequence, on the command line, and its name."""
     adaptive: ClassVar[bool] = False
     """Whether the functions depend on their own coefficients, which are then fed back at every sample."""
 
@@ -171,6 +173,10 @@ class Basis(Settings, ABC):
     @classmethod
     def from_words(cls, words: tuple[Any, ...]) -> Self:
         """The basis from a sequence of numbers, as on the command line."""
+        if cls.sequence is not None:
+            first, name = cls.sequence
+            own = (each.name for each in fields(cls) if each.name != name)  # type: ignore[arg-type]
+            return cls(**{name: words[first:]}, **dict(zip(own, words[:first], strict=False)))
         try:
             return cls(*words)
         except TypeError:
@@ -220,10 +226,7 @@ class _Orthogonal(Basis):
     range: Any
 
     letter: ClassVar[str]
-
-    @classmethod
-    def from_words(cls, words: tuple[Any, ...]) -> Self:
-        return cls(words[0], words[1:])
+    sequence = (1, "range")
 
     def __post_init__(self) -> None:
         owner = type(self).__name__
@@ -286,10 +289,7 @@ class PiecewiseLinear(Basis):
     knots: Any
 
     code: ClassVar[int] = curve_kernels.HINGES
-
-    @classmethod
-    def from_words(cls, words: tuple[Any, ...]) -> Self:
-        return cls(words)
+    sequence = (0, "knots")
 
     def __post_init__(self) -> None:
         self._set("knots", _increasing("PiecewiseLinear", "knots", self.knots))
@@ -324,10 +324,7 @@ class BSpline(Basis):
     anchor: float = 0.0
 
     code: ClassVar[int] = curve_kernels.SPLINES
-
-    @classmethod
-    def from_words(cls, words: tuple[Any, ...]) -> Self:
-        return cls(words[0], words[1:])
+    sequence = (1, "knots")
 
     def __post_init__(self) -> None:
         self._set("degree", whole("BSpline", "degree", self.degree, 1))
@@ -372,10 +369,7 @@ class Sigmoid(Basis):
     width: float
 
     code: ClassVar[int] = curve_kernels.SIGMOIDS
-
-    @classmethod
-    def from_words(cls, words: tuple[Any, ...]) -> Self:
-        return cls(words[1:], words[0])
+    sequence = (1, "centres")
 
     def __post_init__(self) -> None:
         self._set("centres", _increasing("Sigmoid", "centres", self.centres))

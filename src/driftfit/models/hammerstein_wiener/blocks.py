@@ -16,9 +16,7 @@ the point of the range nearest to 0. Ratios such as b_j / b_1, and the local gai
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +25,7 @@ from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, split
+from driftfit.models.hammerstein_wiener.structure import Spans
 
 INPUTS, OUTPUTS = ("unit", "c1", "b1"), ("d1", "unit", "slope")
 
@@ -154,16 +153,16 @@ class Blocks:
         cov = None if self.cov is None else _carried(self.cov, x * scale, scale, rate, rates, spans)
         return self._apart(x * scale, cov, (input, output), spans)
 
-    def _together(self) -> tuple[Array, _Spans]:
+    def _together(self) -> tuple[Array, Spans]:
         """a, b, c, d and the intercept concatenated, (T, k), and their positions."""
         rest = [] if self.intercept is None else [self.intercept[:, None]]
-        return np.concatenate([self.a, self.b, self.c, self.d, *rest], axis=1), _spans(self.model)
+        return np.concatenate([self.a, self.b, self.c, self.d, *rest], axis=1), self.model.structure.spans(True, True)
 
-    def _apart(self, x: Array, cov: Array | None, gauged: tuple[str, str], spans: _Spans) -> Blocks:
+    def _apart(self, x: Array, cov: Array | None, gauged: tuple[str, str], spans: Spans) -> Blocks:
         """The blocks with other coefficients."""
         if gauged[0] == "b1":
-            x[:, [b.start for b in spans.b]] = 1.0
-        _a, b, c, d, rest = np.split(x, [spans.b[0].start, spans.c[0].start, spans.d.start, spans.d.stop], axis=1)
+            x[:, [b[0] for b in spans.b]] = 1.0
+        _, b, c, d, rest = np.split(x, [spans.b[0][0], spans.c[0][0], spans.d[0], spans.d[-1] + 1], axis=1)
         intercept = rest[:, 0] if rest.size else None
         std = Groups(self.std.a, *(np.full(part.shape, np.nan) for part in (b, c, d)))
         if cov is not None:
@@ -171,24 +170,7 @@ class Blocks:
         return replace(self, b=b, c=c, d=d, std=std, intercept=intercept, cov=cov, gauged=gauged)
 
 
-class _Spans(NamedTuple):
-    """The positions of b and c of each input, d and the intercept among all coefficients."""
-
-    b: list[slice]
-    c: list[slice]
-    d: slice
-    rest: slice
-
-
-@lru_cache
-def _spans(model: HammersteinWiener) -> _Spans:
-    na, nb, n_in, n_out, intercept = model.structure
-    ends = np.cumsum([na, *nb, *n_in, n_out, intercept]).tolist()
-    all_of = [slice(first, last) for first, last in pairwise(ends)]
-    return _Spans(all_of[: len(nb)], all_of[len(nb) : -2], all_of[-2], all_of[-1])
-
-
-def _output_scale(found: Blocks, output: str, at: float, x: Array, spans: _Spans) -> tuple[Array, Array]:
+def _output_scale(found: Blocks, output: str, at: float, x: Array, spans: Spans) -> tuple[Array, Array]:
     """L (T,), the divisor of d, and d log L / dx (T, k)."""
     rate = np.zeros(x.shape)
     if output == "unit":
@@ -204,18 +186,18 @@ def _output_scale(found: Blocks, output: str, at: float, x: Array, spans: _Spans
 
 
 def _input_scale(
-    found: Blocks, input: str, i: int, output: tuple[Array, Array], x: Array, spans: _Spans
+    found: Blocks, input: str, i: int, output: tuple[Array, Array], x: Array, spans: Spans
 ) -> tuple[Array, Array]:
     """S (T,), by which c of input i is divided, and d log S / dx (T, k)."""
     rate = np.zeros(x.shape)
-    own, lead = x[:, spans.c[i]], spans.c[i].start
+    own, lead = x[:, spans.c[i]], spans.c[i][0]
     rise = found.model.structure.of_inputs(found.model.rise, found.model.structure.n_in)[i]
     with np.errstate(divide="ignore", invalid="ignore"):
         if input == "unit" and rise.any():
             gain = np.where(own @ rise >= 0.0, 1.0, -1.0) * np.linalg.norm(own, axis=1)
             rate[:, spans.c[i]] = own / gain[:, None] ** 2
         elif input == "b1":
-            first = spans.b[i].start
+            first = spans.b[i][0]
             gain = output[0] / x[:, first]
             rate += output[1]
             rate[:, first] -= 1.0 / x[:, first]
@@ -225,7 +207,7 @@ def _input_scale(
     return gain, rate
 
 
-def _carried(cov: Array, x: Array, scale: Array, level: Array, gains: Array, spans: _Spans) -> Array:
+def _carried(cov: Array, x: Array, scale: Array, level: Array, gains: Array, spans: Spans) -> Array:
     """J cov J' of a change of gauge, x (T, k) the coefficients after it: J = diag(scale) + x r'."""
     J = np.zeros(cov.shape)
     J[:, range(x.shape[1]), range(x.shape[1])] = scale
@@ -257,18 +239,11 @@ def radius_of(a: Array) -> Array:
     return found
 
 
-class Separator:
-    """Separates one theta after another, for streams."""
-
-    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        """``names`` of the parameters: those of the model, or of the minimal ones."""
-        if not isinstance(model, HammersteinWiener):
-            raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
-        self.model, self._minimal = model, names != model.names
-
-    def __call__(self, theta: Array, method: str) -> Groups:
-        """a, b, c, d from one theta (n,), or from minimal parameters."""
-        if self._minimal:
-            return Groups(*self.model.structure.groups(theta))
-        one_of("blocks", "method", method, METHODS[:3])
-        return Groups(*(group[0] for group in split(self.model, theta[None], method)[:4]))
+def separated(model: Model, names: tuple[str, ...], theta: Array, method: str) -> Groups:
+    """a, b, c, d from one theta (n,) of these names: those of the model, or of its minimal parameters."""
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
+    if names != model.names:
+        return Groups(*model.structure.groups(theta))
+    one_of("blocks", "method", method, METHODS[:3])
+    return Groups(*(group[0] for group in split(model, theta[None], method)[:4]))

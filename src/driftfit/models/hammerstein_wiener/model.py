@@ -37,18 +37,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any, ClassVar, Self
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, Step
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, output_names, warn, whole
-from driftfit.models.base import Model
+from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.forward import play
-from driftfit.models.hammerstein_wiener.steps import DIGITS, applying, build, refusing
+from driftfit.models.hammerstein_wiener.steps import DIGITS, build
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
 from driftfit.models.inputs import CountedInputs
@@ -81,7 +81,7 @@ def _plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class HammersteinWiener(CountedInputs):
+class HammersteinWiener(CountedInputs, Implicit):
     """Hammerstein-Wiener model.
 
     Parameters
@@ -170,15 +170,6 @@ class HammersteinWiener(CountedInputs):
     def settings(self) -> dict[str, Any]:
         return {name: _plain(value) for name, value in super().settings().items()}
 
-    @classmethod
-    def from_settings(cls, settings: dict[str, Any]) -> Self:
-        bases = {"input": _blocks(settings.get("input")), "output": _blocks(settings.get("output"))}
-        return super().from_settings(settings | bases)
-
-    @property
-    def width(self) -> int:
-        return 1
-
     @property
     def bases(self) -> tuple[Basis, ...]:
         """Functions of the curve of each input."""
@@ -232,10 +223,10 @@ class HammersteinWiener(CountedInputs):
             names = [each.replace(f"[u{i + 1}]", f"[{name}]") for each in names]
         return tuple(names)
 
-    @property
+    @cached_property
     def rise(self) -> Array:
         """r with r'c > 0 for the curves that rise, of each input (sum of n_in,); 0 where c_1 = 1 by definition."""
-        return _rise(self)
+        return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in self.bases])
 
     @property
     def linear(self) -> bool:
@@ -243,28 +234,17 @@ class HammersteinWiener(CountedInputs):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return {"blocks": _memory(self).copy()}
+        sigma = self.output_noise[0] if several(self.output_noise) else self.output_noise
+        return {"blocks": memory(self.structure, self.delays, self.bases, self.out, sigma or 0.0, self._least_noise)}
 
-    @property
-    def input_memory(self) -> int:
-        return max(count + delay for count, delay in zip(self.structure.nb, self.delays, strict=True)) - 1
-
-    @property
-    def refuse(self) -> Any:
-        return refusing(self.places)
-
-    @property
+    @cached_property
     def places(self) -> tuple[int, ...]:
         """The positions of all numbers in the memory of the steps."""
-        return _places(self)
+        return places_of(self.structure, self.delays, self.bases, self.out)
 
     @property
     def steps(self) -> ModelSteps:
-        return _steps(self)
-
-    @property
-    def apply(self) -> Step | None:
-        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
+        return build(tuple(basis.kind for basis in self.bases), self.out.kind, self.places)
 
     @property
     def reach(self) -> int:
@@ -281,8 +261,8 @@ class HammersteinWiener(CountedInputs):
         return range(t + min(self.delays), t + max(ends))
 
     @property
-    def implicit(self) -> bool:
-        return True
+    def implicit(self) -> Implicit:
+        return self
 
     def expand(self, theta: Array) -> Array | None:
         return self.structure.products(theta) if theta.shape[-1] == self.structure.n_x else None
@@ -304,17 +284,6 @@ class HammersteinWiener(CountedInputs):
         found: Array = np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1)
         return found
 
-    def log_jacobian(self, theta: Array, y: Array) -> Array:
-        """log max(F'(y_t; d_t), f) with the estimate after the sample, the factor that converts the density of z into
-        that of y; f is 1e-3 of the slope of the functions.
-
-        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
-        y integrates to 1 with the estimate after the sample, and to more with the one before.
-        """
-        with np.errstate(invalid="ignore"):
-            found: Array = np.log(np.maximum(self.slope(theta, y), _flattest(self)))
-        return found
-
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of w to one equation error: that of 1 / A(z)."""
         response: Array = np.eye(1, h)[0]
@@ -324,8 +293,13 @@ class HammersteinWiener(CountedInputs):
         return response
 
     def output_slope(self, theta: Array, y: Array) -> Array:
-        """F'(y), at least 1e-3 of the slope of the functions: an equation error moves y by its reciprocal."""
-        found: Array = np.maximum(self.slope(theta, y), _flattest(self))
+        """F'(y_t; d_t) with the estimate after the sample, at least 1e-3 of the slope of the functions.
+
+        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
+        y integrates to 1 with the estimate after the sample, and to more with the one before.
+        """
+        with np.errstate(invalid="ignore"):
+            found: Array = np.maximum(self.slope(theta, y), SLOPE_SHARE * self.out.steepness)
         return found
 
     def noise_factor(self, theta: Array, y: Array) -> float:
@@ -333,7 +307,12 @@ class HammersteinWiener(CountedInputs):
         if self.output_noise is None:
             return 1.0
         energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
-        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + _least_noise(self))
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + self._least_noise)
+
+    @property
+    def _least_noise(self) -> float:
+        """The slope of the identity is 1, so that it needs no floor."""
+        return 0.0 if self.linear else VARIANCE_SHARE * self.out.height**2
 
     def settled(self, phi: Array, y: Array, u: Array, at: Array) -> Array:
         if not any(basis.adaptive for basis in self.bases):
@@ -375,35 +354,3 @@ class HammersteinWiener(CountedInputs):
                     f"{values.max():g})).",
                     UserWarning,
                 )
-
-
-@lru_cache
-def _flattest(model: HammersteinWiener) -> float:
-    return SLOPE_SHARE * model.out.steepness
-
-
-@lru_cache
-def _least_noise(model: HammersteinWiener) -> float:
-    """The slope of the identity is 1, so that it needs no floor."""
-    return 0.0 if model.linear else VARIANCE_SHARE * model.out.height**2
-
-
-@lru_cache
-def _places(model: HammersteinWiener) -> tuple[int, ...]:
-    return places_of(model.structure, model.delays, model.bases, model.out)
-
-
-@lru_cache
-def _memory(model: HammersteinWiener) -> Array:
-    sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
-    return memory(model.structure, model.delays, model.bases, model.out, sigma or 0.0, _least_noise(model))
-
-
-@lru_cache
-def _rise(model: HammersteinWiener) -> Array:
-    return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in model.bases])
-
-
-@lru_cache
-def _steps(model: HammersteinWiener) -> ModelSteps:
-    return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)

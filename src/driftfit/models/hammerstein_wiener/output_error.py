@@ -21,7 +21,6 @@ outputs of the linear block. The model's values for the present input and output
 
 from __future__ import annotations
 
-from collections import namedtuple
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +29,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, nothing, packed, part, shared, wholes
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing, part, shared
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, minimal_memory, structure_of
@@ -51,13 +50,6 @@ The cross-covariances shrink along."""
 POWER_WEIGHT, POWER_LIMIT = 0.01, 25.0
 """The weight of a sample in the usual power of v, and the largest multiple of that power that its square counts as, so
 that a fault code cannot become the scale.
-"""
-
-_Own = namedtuple("_Own", "time q_w p_w begun valid observed ok e h s least_slope v_power")
-OWN = _Own(*range(12))
-"""Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, what the sample has, the
-innovation, its variance without and with the noise, and the least slope of F; from v_power on the usual power of v of
-each input.
 """
 
 
@@ -138,23 +130,22 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, scratch: Ar
 
 
 @shared
-def absorb(own: Array, theta: Array, w: Array, S: Array, moved: Array) -> None:
-    """The measurement update, with ``moved`` = S h of the forecast."""
+def absorb(e: float, s: float, theta: Array, w: Array, S: Array, moved: Array) -> None:
+    """The measurement update for an innovation e of variance s, with ``moved`` = S h of the forecast."""
     n_w = len(w)
-    if own[OWN.ok] > 0.0:
-        for x in range(len(S)):
-            k = moved[x] / own[OWN.s]
-            if x < n_w:
-                w[x] += k * own[OWN.e]
-            else:
-                theta[x - n_w] += k * own[OWN.e]
-            for z in range(x):
-                S[x, z] -= k * moved[z]
-            S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
+    for x in range(len(S)):
+        k = moved[x] / s
+        if x < n_w:
+            w[x] += k * e
+        else:
+            theta[x - n_w] += k * e
+        for z in range(x):
+            S[x, z] -= k * moved[z]
+        S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
 
 
 @shared
-def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
+def unknown_power(m: Array, p: Places, theta: Array, v_power: Array) -> float:
     """The variance that missing inputs leave in w, sum b_j^2 times the usual power of v; 0 where all are there."""
     total = 0.0
     for i in range(p[AT.inputs]):
@@ -165,12 +156,12 @@ def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
             missing = 0
             for k in range(n_in):
                 missing += 0 if abs(m[f + j * n_in + k, 0]) < LARGEST else 1
-            total += max(theta[b + j] * theta[b + j] * own[OWN.v_power + i], TINY) if missing > 0 else 0.0
+            total += max(theta[b + j] * theta[b + j] * v_power[i], TINY) if missing > 0 else 0.0
     return total
 
 
 @shared
-def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
+def follow_power(m: Array, p: Places, theta: Array, v_power: Array) -> None:
     """Update the usual power of v, which is used for missing inputs."""
     for i in range(p[AT.inputs]):
         at = AT.count + INPUT.count * i
@@ -178,9 +169,8 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
         for k in range(p[at + INPUT.n_in] - 1):
             v += theta[p[at + INPUT.c] + k] * m[f + 1 + k, 0]
         if abs(v) < LARGEST:
-            power = own[OWN.v_power + i]
-            moved = POWER_WEIGHT * (min(v * v, POWER_LIMIT * power) - power)
-            own[OWN.v_power + i] += moved if power > 0.0 else v * v
+            moved = POWER_WEIGHT * (min(v * v, POWER_LIMIT * v_power[i]) - v_power[i])
+            v_power[i] += moved if v_power[i] > 0.0 else v * v
 
 
 @shared
@@ -196,94 +186,87 @@ def reach_of(m: Array, p: Places) -> float:
 
 
 @lru_cache
-def _forecasting(out: Kind) -> Any:
-    """The time update and the forecast, for the functions of an output basis."""
-    fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), inverse_of(out)
+def _following(p: tuple[int, ...]) -> Step:
+    """`follow_power` of a state."""
+    orders, rows = np.array(p), room(p)
 
-    def output_error_work(
-        m: Array, p: Places, own: Array, theta: Array, phi: Array, w: Array, S: Array, scratch: Array
-    ) -> None:
-        n_out, d, free = p[AT.n_out], p[AT.d_now], p[AT.x_d]
-        for k in range(n_out - 1):
-            m[d + k + 1, 0] = theta[free + k]
-        if own[OWN.begun] == 0.0 and m[NUMBER.started, 0] > 0.0:
-            past_levels(m, p, w, S, own[OWN.p_w])
-            own[OWN.begun] = 1.0
-        power = unknown_power(m, p, theta, own)
-        advance(p, theta, phi, w, S, scratch, own[OWN.q_w] + power, reach_of(m, p))
-        y_hat, y = (w[0] if p[AT.identity] > 0 else invert(m, p, w[0])), m[NUMBER.raw, 0]
-        able = abs(y_hat) < np.inf
-        fill_trial(m, p, y_hat if able else 0.0, p[AT.trial], p[AT.trial_bend])
-        slope = 0.0
-        for k in range(n_out):
-            slope += m[d + k, 0] * m[p[AT.trial_bend] + k, 0]
-        valid, observed = power == 0.0 and able and own[OWN.begun] > 0.0, abs(y) < np.inf
-        used = valid and observed and m[NUMBER.given, 0] < np.inf
-        own[OWN.valid], own[OWN.observed] = 1.0 if valid else 0.0, 1.0 if observed else 0.0
-        own[OWN.ok], own[OWN.e] = 1.0 if used else 0.0, y - y_hat if used else 0.0
-        row, slope = scratch[0], max(slope, own[OWN.least_slope])
-        for x in range(len(S)):
-            row[x] = 0.0
-        row[0] = 1.0 / slope
-        for k in range(1, n_out):
-            row[len(w) + free + k - 1] = -m[p[AT.trial] + k, 0] / slope
-        own[OWN.h] = product(S, row, scratch[1], 0.0)
-        m[NUMBER.predicted, 0], m[NUMBER.late, 0] = y_hat, 0.0
-
-    return shared(output_error_work)
-
-
-@lru_cache
-def output_error(out: Kind, p: tuple[int, ...]) -> Any:
-    """The compiled routine, for the functions of an output basis and the places of a model: time update and forecast,
-    or the correction. ``fields`` are the addresses of the arrays.
-    """
-    work, orders, rows = _forecasting(out), np.array(p), room(p)
-
-    def machine_output_error(fields: int, n_x: int, n: int, correcting: int) -> None:
-        at, n_w, size = wholes(fields, 1, 9), max(orders[AT.na], 1), OWN.v_power + orders[AT.inputs]
-        N, m = n_w + n_x, floats(at[0, 0], rows, 1)
-        theta, phi, w = floats(at[0, 1], 1, n_x)[0], floats(at[0, 2], 1, n)[0], floats(at[0, 4], 1, n_w)[0]
-        q, P, S = floats(at[0, 3], n_x, n_x), floats(at[0, 8], n_x, n_x), floats(at[0, 5], N, N)
-        scratch, own = floats(at[0, 6], 2, N), floats(at[0, 7], 1, size)[0]
-        if correcting > 0:
-            absorb(own, theta, w, S, scratch[1])
-            follow_power(m, orders, theta, own)
-            for i in range(n_x):
-                for j in range(i + 1):
-                    P[i, j] = S[n_w + i, n_w + j]
-        else:
-            for i in range(n_x):
-                for j in range(i + 1):
-                    S[n_w + i, n_w + j] += q[i, j] * own[OWN.time]
-            work(m, orders, own, theta, phi, w, S, scratch)
-
-    return machine(machine_output_error)
-
-
-@lru_cache
-def _steps(machine_pair: Any) -> TrackerSteps:
     @kernel
-    def call(s: State, correcting: int) -> None:
-        fields = packed((
-            s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data, s.w.ctypes.data,
-            s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
-        ))  # fmt: skip
-        machine_pair(fields, s.theta.shape[0], s.phi.shape[0], correcting)
+    def follow(s: State, l: int) -> None:
+        n, m = s.theta.shape[0], s.v_power.shape[0]
+        theta, v_power = floats(s.theta.ctypes.data, 1, n)[0], floats(s.v_power.ctypes.data, 1, m)[0]
+        follow_power(floats(s.blocks.ctypes.data, rows, 1), orders, theta, v_power)
+
+    return follow  # type: ignore[no-any-return]
+
+
+@kernel
+def advance_states(s: State, p: Places, m: Array, S: Array, scratch: Array, l: int) -> float:
+    """The time update of xi and w; returns the variance that missing inputs leave in w."""
+    n_w, n_x, d = max(p[AT.na], 1), s.theta.shape[0], p[AT.d_now]
+    theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
+    phi, v_power = floats(s.phi.ctypes.data, 1, p[AT.n])[0], floats(s.v_power.ctypes.data, 1, p[AT.inputs])[0]
+    for i in range(n_x):
+        for j in range(i + 1):
+            S[n_w + i, n_w + j] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
+    for k in range(p[AT.n_out] - 1):
+        m[d + k + 1, 0] = theta[p[AT.x_d] + k]
+    if s.begun[l] == 0.0 and m[NUMBER.started, 0] > 0.0:
+        past_levels(m, p, w, S, s.p_w[l])
+        s.begun[l] = 1.0
+    power = unknown_power(m, p, theta, v_power)
+    advance(p, theta, phi, w, S, scratch, s.q_w[l] + power, reach_of(m, p))
+    return power  # type: ignore[no-any-return]
+
+
+@lru_cache
+def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
+    """The steps for the functions of an output basis and the places of a model."""
+    orders, rows, n_w, curved = np.array(p), room(p), max(p[AT.na], 1), not p[AT.identity]
+    n_out, d, free, g, h = p[AT.n_out], p[AT.d_now], p[AT.x_d], p[AT.trial], p[AT.trial_bend]
+    n_x = free + n_out - 1 + intercept
+    N, follow = n_w + n_x, _following(p)
+    fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), shared(inverse_of(out).py_func)
 
     @kernel
     def forecast(s: State, l: int) -> None:
-        s.own[OWN.time, l] = s.dt[l] * s.drift[l]
-        call(s, 0)
-        given = s.blocks[NUMBER.given, l]
-        s.valid[l], s.observed[l], s.ok[l] = s.own[OWN.valid, l], s.own[OWN.observed, l], s.own[OWN.ok, l]
-        s.e[l], s.h[l], s.y_hat[l] = s.own[OWN.e, l], s.own[OWN.h, l], s.blocks[NUMBER.predicted, l]
+        m, S, scratch = (
+            floats(s.blocks.ctypes.data, rows, 1),
+            floats(s.S.ctypes.data, N, N),
+            floats(s.scratch.ctypes.data, 2, N),
+        )
+        power = advance_states(s, orders, m, S, scratch, l)
+        y_hat, y = s.w[0, l], m[NUMBER.raw, 0]
+        if curved:
+            y_hat = invert(m, orders, y_hat)
+        able = abs(y_hat) < np.inf
+        fill_trial(m, orders, y_hat if able else 0.0, g, h)
+        slope = 0.0
+        for k in range(n_out):
+            slope += m[d + k, 0] * m[h + k, 0]
+        slope, given = max(slope, s.least_slope[l]), m[NUMBER.given, 0]
+        valid, observed = power == 0.0 and able and s.begun[l] > 0.0, abs(y) < np.inf
+        used = valid and observed and given < np.inf
+        s.valid[l], s.observed[l] = 1.0 if valid else 0.0, 1.0 if observed else 0.0
+        s.ok[l], s.e[l] = 1.0 if used else 0.0, y - y_hat if used else 0.0
+        for x in range(N):
+            scratch[0, x] = 0.0
+        scratch[0, 0] = 1.0 / slope
+        for k in range(1, n_out):
+            scratch[0, n_w + free + k - 1] = -m[g + k, 0] / slope
+        s.h[l] = product(S, scratch[0], scratch[1], 0.0)
+        m[NUMBER.predicted, 0], m[NUMBER.late, 0], s.y_hat[l] = y_hat, 0.0, y_hat
         s.noise[l] = given if given < np.inf else 1.0
 
     @kernel
     def correct(s: State, l: int) -> None:
-        s.own[OWN.ok, l], s.own[OWN.s, l] = s.ok[l], s.s[l]
-        call(s, 1)
+        theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
+        S, scratch = floats(s.S.ctypes.data, N, N), floats(s.scratch.ctypes.data, 2, N)
+        if s.ok[l] > 0.0:
+            absorb(s.e[l], s.s[l], theta, w, S, scratch[1])
+        follow(s, l)
+        for i in range(n_x):
+            for j in range(i + 1):
+                s.P[i, j, l] = S[n_w + i, n_w + j]
 
     return TrackerSteps(nothing, forecast, correct)
 
@@ -291,16 +274,14 @@ def _steps(machine_pair: Any) -> TrackerSteps:
 @lru_cache
 def _applying(place: Step, p: tuple[int, ...]) -> Step:
     """The input also updates the usual power of v."""
-    orders, rows = np.array(p), room(p)
+    follow = _following(p)
 
+    @kernel
     def apply(s: State, l: int) -> None:
         place(s, l)
-        m, n, k = floats(s.blocks.ctypes.data, rows, 1), s.theta.shape[0], s.own.shape[0]
-        theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, k)[0]
-        follow_power(m, orders, theta, own)
+        follow(s, l)
 
-    step: Step = kernel(apply)
-    return step
+    return apply  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -351,15 +332,13 @@ class OutputError(Minimal):
         structure = structure_of("OutputError", model)
         n_w = max(structure.na, 1)
         N = n_w + structure.n_x
-        own = np.zeros(OWN.v_power + model.m)
         assert isinstance(model, HammersteinWiener)
-        least = SLOPE_SHARE * model.out.steepness
-        own[[OWN.q_w, OWN.p_w, OWN.least_slope]] = self.q_w, self.p_w, least
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {
-            **self.state(structure.n_x), "blocks": minimal_memory(model), "own": own,
-            "w": np.zeros(n_w), "S": S, "scratch": np.zeros(2 * N),
+            **self.state(structure.n_x), "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
+            "scratch": np.zeros((2, N)), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0,
+            "least_slope": SLOPE_SHARE * model.out.steepness, "v_power": np.zeros(model.m),
         }  # fmt: skip
 
     def steps_for(self, model: Model) -> TrackerSteps:
@@ -367,14 +346,12 @@ class OutputError(Minimal):
         if len(model.outputs) > 1:
             raise ValueError("OutputError: follows one output at a time; track each output by itself.")
         assert isinstance(model, HammersteinWiener)
-        routine = output_error(model.out.kind, model.places)
-        for one in (model.out.evaluate, routine):  # the first routine calls the second
-            one.load()
-        return _steps(routine)
+        return _steps(model.out.kind, model.places, model.intercept)._replace(machines=(model.out.evaluate,))
 
     def apply_for(self, model: Model) -> Step | None:
         assert isinstance(model, HammersteinWiener)
-        return None if model.apply is None else _applying(model.apply, model.places)
+        late = model.steps.apply
+        return None if late is None else _applying(late, model.places)
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         n_w = len(lane["w"])

@@ -163,8 +163,8 @@ class LeastSquares:
     """theta = g(zeta) with all of c free, zeta = (a, b, c, d_2 .., l), and its generalised least squares fit."""
 
     def __init__(self, s: Structure) -> None:
-        spans, inputs = s.spans(free=True), len(s.nb)
-        self.s, self.n_z, self.b, self.c = s, sum(map(len, spans)), spans[1 : 1 + inputs], spans[1 + inputs : -2]
+        self.s, self.spans = s, s.spans(free=True)
+        self.b, self.c, self.n_z = self.spans.b, self.spans.c, s.n_x + len(s.nb)
 
     def refine(self, theta: Array, P: Array, zeta: Array) -> tuple[Array, Array, Array]:
         """zeta (T, n_z), its covariance (T, n_z, n_z) and the cost (T,), from a zeta with |c| = 1.

@@ -332,7 +332,9 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
         for routine in (*(one[0] for one in into), out[0], *own):
             routine.load()
 
-    return ModelSteps(regress, push, ready, partial(foreseeing, out, p) if curved else None)
+    oldest = max(own[INPUT.nb] + own[INPUT.nk] for own in np.reshape(p[AT.count :], (-1, INPUT.count)).tolist()) - 1
+    foresee, apply = partial(foreseeing, out, p) if curved else None, applying(into, p) if p[AT.nk] > 0 else None
+    return ModelSteps(regress, push, ready, foresee, apply, oldest, refusing(p), width=1)
 
 
 @lru_cache
@@ -393,7 +395,7 @@ def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
 
 @lru_cache
 def refusing(p: tuple[int, ...]) -> Any:
-    """`Model.refuse`: the functions of an input are missing, also from the row of the next sample."""
+    """`ModelSteps.refuse`: the functions of an input are missing, also from the row of the next sample."""
     inputs, own = p[AT.inputs], np.array(p[AT.count :]).reshape(-1, INPUT.count)
     begin, width, count, delay = (tuple(own[:, k].tolist()) for k in (INPUT.f, INPUT.n_in, INPUT.nb, INPUT.nk))
     at = tuple((own[:, INPUT.b] + p[AT.next]).tolist())

@@ -39,6 +39,16 @@ from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 
 
+class Spans(NamedTuple):
+    """The positions of a, b of each input, c of each input, d and the intercept among coefficients."""
+
+    a: Array
+    b: list[Array]
+    c: list[Array]
+    d: Array
+    rest: Array
+
+
 class Structure(NamedTuple):
     """Orders of a Hammerstein-Wiener model; ``nb`` and ``n_in`` have an entry for each input."""
 
@@ -76,17 +86,17 @@ class Structure(NamedTuple):
         """The labels that distinguish the coefficients of several inputs in their names."""
         return tuple(f"[u{i + 1}]" for i in range(len(self.nb))) if len(self.nb) > 1 else ("",)
 
-    def lags(self, tag: int) -> list[str]:
-        """Names of the b of an input."""
-        return [f"b{j + 1}{self.tags[tag]}" for j in range(self.nb[tag])]
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the entries of theta."""
-        a = [f"A{i + 1}" for i in range(self.na)]
-        b = [name for i in range(len(self.nb)) for name in self.lags(i)]
-        d = [f"d{k}" for k in range(2, self.n_out + 1)]
-        bc = [f"{name}*c{k}" for i, n_in in enumerate(self.n_in) for k in range(2, n_in + 1) for name in self.lags(i)]
+        a, b, _, (_, *d) = self.groups_names
+        lags = [b[end - nb : end] for nb, end in zip(self.nb, np.cumsum(self.nb).tolist(), strict=True)]
+        bc = [
+            f"{name}*c{k}"
+            for own, n_in in zip(lags, self.n_in, strict=True)
+            for k in range(2, n_in + 1)
+            for name in own
+        ]
         ad = [f"{name}*{last}" for last in d for name in a]
         return (*a, *b, *d, *bc, *ad, *(("intercept",) if self.intercept else ()))
 
@@ -95,7 +105,7 @@ class Structure(NamedTuple):
         """Names of a, b, c and d, the leading coefficients of the curves among them."""
         return (
             tuple(f"A{i + 1}" for i in range(self.na)),
-            tuple(name for i in range(len(self.nb)) for name in self.lags(i)),
+            tuple(f"b{j + 1}{tag}" for tag, nb in zip(self.tags, self.nb, strict=True) for j in range(nb)),
             tuple(f"c{k + 1}{tag}" for tag, n_in in zip(self.tags, self.n_in, strict=True) for k in range(n_in)),
             tuple(f"d{k + 1}" for k in range(self.n_out)),
         )
@@ -145,11 +155,12 @@ class Structure(NamedTuple):
         J[..., products, second] = x[..., first]
         return J
 
-    def spans(self, free: bool) -> list[Array]:
-        """The positions of a, b of each input, c of each input, d_2 .. and l in xi, or in zeta if c_1 is ``free``."""
-        c = [n_in - 1 + free for n_in in self.n_in]
-        ends = np.cumsum([0, self.na, *self.nb, *c, self.n_out - 1, self.intercept])
-        return [np.arange(first, last) for first, last in pairwise(ends)]
+    def spans(self, free: bool, lead: bool = False) -> Spans:
+        """Their positions in xi; in zeta if c_1 is ``free``, and among all coefficients if d_1 is one of them too."""
+        m, c = len(self.nb), [n_in - 1 + free for n_in in self.n_in]
+        ends = np.cumsum([0, self.na, *self.nb, *c, self.n_out - 1 + lead, self.intercept])
+        a, *both, d, rest = (np.arange(first, last) for first, last in pairwise(ends))
+        return Spans(a, both[:m], both[m:], d, rest)
 
 
 @lru_cache
@@ -157,8 +168,7 @@ def positions(s: Structure, free: bool) -> tuple[Array, Array]:
     """(entry of theta, entry of xi) of the parameters that appear in theta alone, (2, k), and (entry of theta, entry of
     xi, entry of xi) of the products b c and a d, (3, k); for zeta in the place of xi if c_1 is ``free``.
     """
-    spans, (at_d, row, at_ad), m = s.spans(free), s.starts, len(s.nb)
-    a, bs, cs, d, rest = spans[0], spans[1 : 1 + m], spans[1 + m : -2], spans[-2], spans[-1]
+    (a, bs, cs, d, rest), (at_d, row, at_ad) = s.spans(free), s.starts
     alone = [(i, i) for i in (a if free else range(at_d))]
     alone += [(at_d + k, x) for k, x in enumerate(d)] + [(s.n - 1, x) for x in rest]
     pairs = [(j, j, c[0]) for b, c in zip(bs, cs, strict=True) for j in (b if free else ())]

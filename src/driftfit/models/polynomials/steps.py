@@ -14,7 +14,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, SMALLEST, ModelSteps
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.models.base import GAP
-from driftfit.models.linearised import along, informed, restore, subtract
+from driftfit.models.lags import informed
+from driftfit.models.linearised import along, restore, subtract
 
 SETTLING = 4.0
 """Samples for each parameter, at the start, that are a pseudolinear regression."""
@@ -43,7 +44,6 @@ NOISE = 1e3
 FIRST, RISE, FALL = 10.0, 10.0, 0.1
 """After the first samples, the factor by which the largest reading grows at most at one (before, by BEYOND); and the
 factor by which it falls at a reading that it is BEYOND times."""
-
 
 Y, YF, V, VF, E, EF, ONE, OWN = range(8)
 """Rows of the past: the output and D/C of it, v and 1/C v, e and 1/C e, D/C 1; then EACH rows for every input."""

@@ -40,7 +40,7 @@ class Window:
     """The last ``lag`` + 1 samples of a stream, and the information from earlier samples."""
 
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
-        if model.noise_varies:
+        if model.implicit and model.implicit.noise_varies:
             raise ValueError(
                 "Live: lag= does not support the output_noise of a model; smooth the record, or leave output_noise out."
             )

@@ -1,7 +1,7 @@
 """What a stream stores in addition to its tile: time, limits, late inputs, windows and alarms; and its files.
 
 It also holds what an operator may do to a stream, and takes inputs that come after the output of their sample, as in a
-control loop: the model then stores the same as if both had come in one row of a record (`Model.apply`).
+control loop: the model then stores the same as if both had come in one row of a record (`ModelSteps.apply`).
 """
 
 from __future__ import annotations

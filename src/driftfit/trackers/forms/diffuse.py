@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, in_units_of_noise
-from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
+from driftfit.engine.kernel import Array, State, Step, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
 from driftfit.trackers.forms.covariance import LEFT, prediction
 from driftfit.trackers.forms.information import spread
 
@@ -86,6 +86,11 @@ def knowing_nothing(n: int, worst: float = WORST) -> Mapping[str, Any]:
 def knowing(n: int) -> Mapping[str, Any]:
     """The same fields for a proper prior."""
     return {**knowing_nothing(n), "rank": n, "root": 0}
+
+
+def before_any_sample(n: int, p0: Any) -> Mapping[str, Any]:
+    """The fields for a prior covariance, or for None."""
+    return knowing_nothing(n) if p0 is None else knowing(n)
 
 
 @shared
@@ -483,6 +488,9 @@ def spanned_variance(s: State, l: int) -> None:
         s.var[i, l] = in_units_of_noise(var, s.scale[l]) if var < np.inf else np.inf
 
 
-def started(steps: TrackerSteps, first: TrackerSteps) -> TrackerSteps:
+def started(
+    steps: TrackerSteps, predict: Step, correct: Step = correct_on_roots, forecast: Step = forecast_on_roots
+) -> TrackerSteps:
     """The steps of a tracker of theta and P, with those of its square-root form, from which it starts."""
-    return steps._replace(start=first._replace(take_over=take_over), machines=MACHINES)
+    first = TrackerSteps(predict, forecast, correct, spanned_variance, take_over=take_over)
+    return steps._replace(start=first, machines=MACHINES)

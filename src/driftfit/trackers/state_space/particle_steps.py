@@ -11,7 +11,7 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.forms.covariance import LEFT, read_drift
-from driftfit.trackers.joint_kalman import MOST, moves_are_finite
+from driftfit.trackers.joint_kalman import REPEAT_LIMIT, moves_are_finite
 from driftfit.trackers.state_space.draws import normal, uniform
 
 HALF_LOG_2_PI = 0.9189385332046727
@@ -59,7 +59,7 @@ def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -
 
     @kernel
     def repeated(s: State, p: int, l: int) -> None:
-        left = 1.0 if timed else min(max(1.0, s.dt[l]), MOST)
+        left = 1.0 if timed else min(max(1.0, s.dt[l]), REPEAT_LIMIT)
         while left > 0.5:
             move(s, p, l)
             left -= 1.0
