@@ -91,7 +91,7 @@ def hold_before(s: State, signal: int, age: int, l: int) -> None:
 
 
 @lru_cache
-def taking_late(take_inputs: Step) -> Step:
+def taking_late(take_inputs: Any) -> Any:
     """`ModelSteps.apply`: where a record takes the inputs in, their sample has not been counted yet."""
 
     @kernel
@@ -101,7 +101,7 @@ def taking_late(take_inputs: Step) -> Step:
         take_inputs(s, l)
         s.usable[l] += counted
 
-    return take_late  # type: ignore[no-any-return]
+    return take_late
 
 
 @lru_cache
