@@ -148,7 +148,7 @@ Written by `python -m lab bench accuracy --out docs`, which prints every figure.
 *RMSE* is the error of the parameters after 200 samples. *Oracle* is the Kalman filter that is given the drift
 covariance and the noise variance of every sample. Ratios to it are computed for each run: tables have the medians of
 RMSE and of the one-step error, pictures the quartiles. A row that repeats one above is left out. In *ramp* and
-*sinusoid* the oracle is told the size of the steps, not that they persist. *In band* gives shares within 95 % bands;
+*sinusoid* the oracle is given the size of the steps, not that they persist. *In band* gives shares within 95 % bands;
 simulated outliers of y are not counted. *Default* is a package with its default settings, *tuned* uses the setting of
 a grid with the least parameter error on other runs of the same scenario, and *Kalman, hindsight* is the best setting
 on the scored runs themselves. A tracker without default settings has no such row.
