@@ -28,19 +28,19 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_360,
-    "statements": 43_661,
+    "lines of the library": 66_755,
+    "statements": 43_283,
     "modules": 328,
     "levels of folders": 2,
-    "constants of modules with numbers": 633,
-    "numbers in the source": 2_481,
+    "constants of modules with numbers": 630,
+    "numbers in the source": 2_428,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
-    "lines of them": 5_267,
+    "lines of them": 5_219,
     "modules that detection imports": 94,
     "modules that a second call of track passes": 9,
     "members of Tracker": 38,
-    "members of Model": 45,
+    "members of Model": 27,
     "members of TrackerSteps": 17,
     "state fields of Kalman": 36,
     "state fields of RLS": 46,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 12_112,
-    "lines of tests": 33_670,
+    "lines of tests": 33_671,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

@@ -40,7 +40,7 @@ def points(live: Live, h: int) -> np.ndarray:
 def outputs(live: Live, theta: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Outputs (S, h) of an ARX model, sample by sample; u (h, m) begins with that of now."""
     lane, terms = live.lane(), live.model.terms or ()
-    past_y = list(lane["y_lag"][::-1])
+    past_y = list(lane["y_lag"][0, ::-1])
     past_u = np.vstack([lane["u_lag"].T[:0:-1], u])
     found = np.zeros(theta.shape[:2])
     for s in range(len(theta)):
@@ -56,7 +56,7 @@ def outputs(live: Live, theta: np.ndarray, u: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("later", [True, False])
 def test_one_sample_ahead_is_the_closed_form(later: bool) -> None:
     live = stream(ARX(1, 1, nk=int(later)))
-    m, P, y = live.theta, live.cov + 1e-3 * np.eye(2), live.lane()["y_lag"][0]
+    m, P, y = live.theta, live.cov + 1e-3 * np.eye(2), live.lane()["y_lag"][0, 0]
     certain = (2.0 - m[0] * y) / m[1]
     cautious = (m[1] * (2.0 - m[0] * y) - P[0, 1] * y) / (m[1] ** 2 + P[1, 1])
     assert live.control(2.0, 1, caution=0.0).u == pytest.approx([certain], rel=1e-6)

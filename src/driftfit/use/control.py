@@ -141,7 +141,7 @@ def _held(live: Live, lane: Any, late: int) -> str:
     if not np.isfinite(live.theta).all() or (live.tracker.covariance and not np.isfinite(live.std).all()):
         return "the data do not determine all parameters yet; apply a test signal"
     lags = [
-        lane["y_lag"][:lag] if what == "y" else lane["u_lag"][j, late:lag] for what, j, lag in live.model.terms or ()
+        lane["y_lag"][0, :lag] if what == "y" else lane["u_lag"][j, late:lag] for what, j, lag in live.model.terms or ()
     ]
     return "" if all(np.isfinite(one).all() for one in lags) else "outputs or inputs of the last samples are missing"
 
@@ -179,7 +179,7 @@ def _responses(model: ARX, lane: Any, points: Array, late: int) -> tuple[Array, 
             elif what == "u" and past < late:
                 effect[:, k, late - past - 1, j] += theta
             else:
-                rest[:, k] += theta * (lane["y_lag"][past] if what == "y" else lane["u_lag"][j, past])
+                rest[:, k] += theta * (lane["y_lag"][0, past] if what == "y" else lane["u_lag"][j, past])
     return rest, effect.reshape(S, h, -1)
 
 
