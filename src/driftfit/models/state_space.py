@@ -237,7 +237,7 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
     """Lags, and whether a sample has all its inputs. What the equations say of it is the tracker's work."""
     system = system_of(equations)
     m, n, reach = len(inputs), len(system.parameters) + len(system.hidden), system.reach
-    complete_at = complete_with(known_input, system.lines, inputs, system.output)
+    complete = complete_with(known_input, system.lines, inputs, system.output)
 
     @kernel
     def regress(s: State, l: int) -> None:
@@ -251,9 +251,9 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
             known = abs(s.u[j, l]) < LARGEST
             s.u_known[j, 0, l] = 1.0 if known else 0.0
             s.u_lag[j, 0, l] = s.u[j, l] if known else s.u_lag[j, min(1, reach), l]
-        complete = complete_at(s, l)
+        usable = complete(s, l)
         for i in range(n):
-            s.phi[i, l] = 1.0 if complete else np.nan
+            s.phi[i, l] = 1.0 if usable else np.nan
 
     @kernel
     def push(s: State, l: int) -> None:
