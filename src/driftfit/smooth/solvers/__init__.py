@@ -1,1 +1,1 @@
-"""How smoothers solve their problems: the problem, elimination from both ends, two filters that meet, rank, mixtures."""
+"""How smoothers solve their problems: the problem, elimination from both ends, two filters that meet, rank, mixture."""
