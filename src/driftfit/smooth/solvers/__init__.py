@@ -1,1 +1,1 @@
-"""Parts of the exact smoother: the problem, elimination from both ends, two filters that meet, rank."""
+"""How smoothers solve their problems: the problem, elimination from both ends, two filters that meet, rank, mixture."""
