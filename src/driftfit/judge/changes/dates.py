@@ -21,12 +21,14 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
 from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
 from driftfit.judge.changes.scan import SINGULAR, SMALL, add
-from driftfit.judge.statistics.robust import cholesky, orthonormal, solved
+from driftfit.judge.statistics.robust import eliminate, orthonormal, solved
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
+DOUBT = 1.5
+"""Standard errors by which a price is changed to see whether the number depends on more draws."""
 SWEEPS = 4
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
@@ -76,7 +78,7 @@ def _at_each(
                     G[i, j] += row[i] * row[j]
         for i in range(k):
             G[i, i] += least
-        rss[d] = cholesky(G, k, 0.0)
+        rss[d] = eliminate(G, k, 0.0)
         solved(G, theta[d])
 
 
@@ -145,19 +147,25 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     gain = N * np.log(test.rss[0] / test.rss[:room])
     first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
 
-    def number(drawn: Array) -> tuple[int, tuple[float, float]]:
-        prices = price(drawn[:, 0], level / SHARE), price(drawn[:, 1], level / SHARE)
-        return stepwise(gain, prices) or first, prices
+    def number(drawn: Array, constants: tuple[Array, Array], most: int) -> tuple[int, tuple[float, float]]:
+        """The number and its prices, from more draws of constants while it may depend on them."""
+        for count in DRAWS:
+            if most > len(drawn) < count:
+                drawn = np.vstack([drawn, draws.gains(*constants, count - len(drawn))])
+            (one, error), (two, other) = (price(each, level / SHARE) for each in drawn.T)
+            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (DOUBT, -DOUBT))
+            if len(drawn) >= DRAWS[1] and few == many:
+                break
+        return stepwise(gain, (one, two)) or first, (one, two)
 
     dynamic = len(noise.lags) or len(model.lags.columns)
-    rest = 0 if dynamic else DRAWS[-1] - len(test.gains)
-    K, prices = number(np.vstack([test.gains, draws.gains(*draws.constants, rest)]))
+    K, prices = number(test.gains, draws.constants, 0 if dynamic else DRAWS[-1])
     if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = test.breaks[K], test.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
-            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
+            K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
     return test.breaks[K], test.ar[K], prices
 
 

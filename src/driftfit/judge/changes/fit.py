@@ -88,10 +88,16 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
-def moments(Z: Array, share: Array | float = ROUNDED) -> Array:
-    """Z' Z of columns Z (N, q), with this share of their mean beside their own, so that it can be inverted."""
-    G = Z.T @ Z
-    return np.asarray(G + np.diag(np.trace(G) / len(G) * share + np.full(len(G), SMALL)))
+def invertible(G: Array, share: Array | float = ROUNDED) -> Array:
+    """Sums of products G (.., q, q), with this share of the mean of their diagonal beside their own."""
+    q = G.shape[-1]
+    mean = np.trace(G, axis1=-2, axis2=-1)[..., None, None] / q
+    return np.asarray(G + (mean * share + SMALL) * np.eye(q))
+
+
+def coefficients(Z: Array, z: Array, share: Array | float = ROUNDED) -> Array:
+    """Least squares (q,) of z (N,) on columns Z (N, q)."""
+    return np.linalg.solve(invertible(Z.T @ Z, share), Z.T @ z)
 
 
 def estimated(
@@ -104,14 +110,14 @@ def estimated(
     Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
     ridge = np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR))
-    beta = np.linalg.solve(moments(Z, ridge), Z.T @ z)
+    beta = coefficients(Z, z, ridge)
     r = z - Z @ beta
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
 
 def left(Z: Array, z: Array, floor: float = SMALL) -> float:
     """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
-    r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
+    r = z - Z @ coefficients(Z, z)
     return max(float(r @ r), floor)
 
 
@@ -286,7 +292,7 @@ def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int 
             rows = split(X, breaks)
         Z, z = white_rows(rows, y, lags, ar, g)
         first = order_of(lags)
-        v = y - rows @ np.linalg.solve(moments(Z), Z.T @ z)
+        v = y - rows @ coefficients(Z, z)
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         size = spread(e, phi)
         level = size * level_of(e / size, first)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, moments, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, invertible, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Recursion, Results, draw
 from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import orthonormal
@@ -211,11 +211,12 @@ def p_of(x: float, drawn: Array) -> float:
     return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
 
 
-def price(drawn: Array, level: float) -> float:
-    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
+def price(drawn: Array, level: float) -> tuple[float, float]:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R, and its standard error."""
     R = len(drawn)
     top = np.sort(drawn)[-max(10, R // 10) :]
-    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
+    mean, reach = float(np.mean(top[1:] - top[0])), np.log(len(top) / (R + 1) / level)
+    return float(top[0] + mean * reach), float(mean * np.sqrt((1.0 + reach**2) / len(top)))
 
 
 def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
@@ -245,7 +246,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
     Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
-    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(moments(Z), Z.T), axis=0), 0.1)
+    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(invertible(Z.T @ Z), Z.T), axis=0), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, few, held)
@@ -257,7 +258,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p * len(R) > CLEAR or (p < SURE and count >= DRAWS[1]):
+        if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     root = max(draws.of_outputs(theta), radius(ar, noise.lags))

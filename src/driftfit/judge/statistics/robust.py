@@ -58,9 +58,9 @@ class Fit(NamedTuple):
 
 
 @shared
-def cholesky(M: Array, n: int, least: float) -> float:
-    """Lower factor of the leading n columns of M (k, k), in place; returns the remaining last entry, M[k-1, k-1].
-    Directions of no more information than ``least`` are left out.
+def eliminate(M: Array, n: int, least: float) -> float:
+    """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal and D^-1 on
+    it. Returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
 
     With n = k - 1 and M = [phi, y]' [phi, y] that entry is the sum of squared residuals.
     """
@@ -69,29 +69,28 @@ def cholesky(M: Array, n: int, least: float) -> float:
         pivot = M[j, j]
         size = pivot
         for i in range(j):
-            pivot -= M[j, i] * M[j, i]
-        root = np.sqrt(pivot) if pivot > max(FLAT * size, least) else 0.0
-        M[j, j] = root
+            pivot -= M[j, i] * M[j, i] * M[i, i]
+        M[j, j] = 1.0 / pivot if pivot > max(FLAT * size, least) else 0.0
         for r in range(j + 1, k):
             total = M[r, j]
             for i in range(j):
-                total -= M[r, i] * M[j, i]
-            M[r, j] = total / root if root > 0.0 else 0.0
+                total -= M[r, i] * M[j, i] * M[i, i]
+            M[r, j] = total
     left: float = M[k - 1, k - 1]
     for i in range(n):
-        left -= M[k - 1, i] * M[k - 1, i]
+        left -= M[k - 1, i] * M[k - 1, i] * M[i, i]
     return left if left > 0.0 else 0.0
 
 
 @shared
 def solved(M: Array, theta: Array) -> None:
-    """theta (n,) from M (n + 1, n + 1) after `cholesky`."""
+    """theta (n,) from M (n + 1, n + 1) after `eliminate`."""
     n = theta.shape[0]
     for i in range(n - 1, -1, -1):
-        total = M[n, i]
+        theta[i] = M[n, i]
         for j in range(i + 1, n):
-            total -= M[j, i] * theta[j]
-        theta[i] = total / M[i, i] if M[i, i] > 0.0 else 0.0
+            theta[i] -= M[j, i] * theta[j]
+        theta[i] *= M[i, i]
 
 
 class Basis(NamedTuple):
