@@ -12,15 +12,16 @@ is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.scan import SINGULAR, SMALL, problem_of, searched
-from driftfit.judge.statistics.robust import deviation, robust_fit
+from driftfit.judge.statistics.robust import deviation, eliminate, robust_fit
 from driftfit.judge.statistics.whiteness import loudest
 
 NONE = np.zeros(0, np.int64)
@@ -135,29 +136,59 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return np.asarray(np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0])
 
 
-def lags_of(v: Array, most: int) -> Array:
-    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear."""
+def _choose(v: Array, ok: Array, most: int, row: Array, G: Array, chosen: Array) -> None:
+    """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses; sums of products to G (k, k) of
+    the lags 1 .. k - 1 and of v (N,) itself, where all of them are ``ok``."""
+    last, N, count = G.shape[0] - 1, v.shape[0], 0
+    for t in range(last, N):
+        whole = True
+        for i in range(last + 1):
+            whole = whole and ok[t - i]
+            row[i - 1 if i > 0 else last] = v[t - i]
+        if whole:
+            count += 1
+            for i in range(last + 1):
+                for j in range(i + 1):
+                    G[i, j] += row[i] * row[j]
+    if count <= 2 * last:
+        return
+    for i in range(last + 1):
+        G[i, i] += SINGULAR * G[i, i] + SMALL
+    eliminate(G, most, 0.0)
+    price = np.log(count + last)
+    least = SINGULAR * G[last, last]
+    left = best = G[last, last]
+    for p in range(1, most + 1):
+        left -= G[last, p - 1] * G[last, p - 1] * G[p - 1, p - 1]
+        if np.log(max(left, least) / best) * count + price * (p - chosen[0]) < 0.0:
+            best, chosen[0] = max(left, least), p
+    share = 0.0
+    for s in range(most, last):
+        rest, tie = G[s, s], G[last, s]
+        for j in range(chosen[0]):
+            rest -= G[s, j] * G[s, j] * G[j, j]
+            tie -= G[s, j] * G[last, j] * G[j, j]
+        if tie * tie > share * best * max(rest, SMALL):
+            share, chosen[1] = min(tie * tie / (best * max(rest, SMALL)), 1.0 - SINGULAR), s + 1
+    if share > 0.0 and -count * np.log1p(-share) < price + 2.0 * np.log(last - most):
+        chosen[1] = 0
+
+
+_chosen = Driver(_choose)
+
+
+def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
+    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
+    Only rows are used that are ``ok`` (N,), as are all their lags."""
     N = len(v)
-    limit = HELD * deviation(v)
-    v = np.clip(v, -limit, limit) if limit > 0.0 else v
-    longest = max(most, min(SEASON, N // 12))
-    if most < 1 or longest >= N // 3:
+    limit = HELD * deviation(v if ok is None else v[ok])
+    if most < 1:
         return NONE
-    rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
-    G = rows.T @ rows
-    G += np.diag(SINGULAR * np.diag(G) + SMALL)
-    count, price = N - longest, np.log(N)
-    own = np.linalg.solve(np.linalg.cholesky(G[1 : most + 1, 1 : most + 1]), G[1 : most + 1, 0])
-    left = np.maximum(G[0, 0] - np.append(0.0, np.cumsum(own**2)), SINGULAR * G[0, 0])
-    p = int(np.argmin(count * np.log(left) + price * np.arange(most + 1)))
-    lags, seasons = np.arange(1, p + 1), np.append(0, np.arange(most + 1, longest + 1))
-    if len(seasons) > 1:
-        ties = G[np.ix_(lags, seasons)]
-        rest = G[np.ix_(seasons, seasons)] - ties.T @ np.linalg.solve(G[np.ix_(lags, lags)], ties)
-        gain = rest[0, 1:] ** 2 / np.maximum(np.diag(rest)[1:], SMALL)
-        if -count * np.log1p(-min(gain.max() / left[p], 1.0 - SINGULAR)) > price + 2.0 * np.log(len(gain)):
-            lags = np.append(lags, seasons[1 + int(np.argmax(gain))])
-    return lags
+    longest, found = max(most, min(season, N // 12)), np.zeros(2, np.int64)
+    v = np.clip(v, -limit, limit) if limit > 0.0 else v
+    ok = np.ones(N, bool) if ok is None else ok
+    _chosen(v, ok, most, np.empty(longest + 1), np.zeros((longest + 1, longest + 1)), found)
+    return np.append(np.arange(1, found[0] + 1), found[found[1:].nonzero()[0] + 1])
 
 
 def level_of(e: Array, first: int) -> Array:
@@ -176,6 +207,7 @@ def level_of(e: Array, first: int) -> Array:
     return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 
+@lru_cache(2 * len(KNOTS))
 def hats(N: int, knots: int) -> Array:
     """(N, knots): piecewise linear functions, each 1 at its own knot."""
     at = np.linspace(0.0, N - 1.0, knots)
@@ -187,22 +219,30 @@ def lined(X: Array, knots: int) -> Array:
     return np.asarray((hats(len(X), knots)[:, :, None] * X[:, None, :]).reshape(len(X), -1))
 
 
-def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
-    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N.
+def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
+    """Sums of products G (knots n + 1, ..) of z (M,) and of Z (M, n) times hats (M, knots): of two of these at most."""
+    n, last, k = Z.shape[1], G.shape[0] - 1, 0
+    for t in range(Z.shape[0]):
+        while k + 2 < hat.shape[1] and not hat[t, k] > 0.0:
+            k += 1
+        for j in range(n):
+            row[j], row[n + j] = Z[t, j] * hat[t, k], Z[t, j] * hat[t, k + 1]
+        for i in range(2 * n):
+            for j in range(2 * n):
+                G[k * n + i, k * n + j] += row[i] * row[j]
+            G[last, k * n + i] += row[i] * z[t]
 
-    Only two hats are not 0 between two knots, so the sums of products there are those of 2 n columns.
-    """
-    n, first, hat = Z.shape[1], N - len(z), hats(N, knots)
-    ends = np.append(0, np.ceil(np.linspace(0.0, N - 1.0, knots)[1:-1]))
-    rows = [slice(max(int(a) - first, 0), max(int(b) - first, 0)) for a, b in pairwise([*ends, N])]
-    G, own = np.zeros((knots * n + 1, knots * n + 1)), np.append(np.arange(2 * n), knots * n)
-    for k, s in enumerate(rows):
-        A = np.hstack([Z[s] * hat[first:][s, k : k + 1], Z[s] * hat[first:][s, k + 1 : k + 2], z[s, None]])
-        G[own[:, None], own] += A.T @ A
-        own[:-1] += n
-    G[np.diag_indices(knots * n)] += ROUNDED * np.trace(G[:-1, :-1]) / (knots * n) + SMALL
-    path = hat @ np.linalg.solve(G[:-1, :-1], G[:-1, -1]).reshape(knots, n)
-    return path, z - np.einsum("tj,tj->t", Z, path[first:])
+
+_accumulated = Driver(_accumulate)
+
+
+def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
+    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N."""
+    n, hat = Z.shape[1], hats(N, knots)
+    own, G = hat[N - len(z) :], np.zeros((knots * n + 1, knots * n + 1))
+    _accumulated(Z, z, own, np.empty(2 * n), G)
+    path = hat @ np.linalg.solve(invertible(G[:-1, :-1]), G[-1, :-1]).reshape(knots, n)
+    return path, z - np.einsum("tj,tj->t", Z, path[N - len(z) :])
 
 
 def divided(
