@@ -30,7 +30,7 @@ from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.changes.dates import undetermined
+from driftfit.judge.changes.dates import informed
 from driftfit.judge.changes.fit import NONE
 from driftfit.judge.changes.fit import shortest as shortest_of
 from driftfit.judge.changes.words import clauses, events
@@ -264,5 +264,5 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
         if n < N:
             freedom = max(N - np.linalg.matrix_rank(R), 1)
             std = np.sqrt(np.sum(inverse**2, axis=1) / N * (e @ e) / freedom)
-            std = np.where(undetermined(phi), np.inf, std)
+            std = np.where(informed(phi)[0], np.inf, std)
     return Segmentation((), (Segment(0, len(run), theta, std),), level, float("nan"), spread, (), run, why)

@@ -20,8 +20,8 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
 from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
-from driftfit.judge.changes.scan import SINGULAR, SMALL, add
-from driftfit.judge.statistics.robust import eliminate, orthonormal, solved
+from driftfit.judge.changes.scan import SINGULAR, add
+from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
@@ -193,7 +193,7 @@ def dated(
             theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
             ar = regressed(noise_of(X, y, theta, breaks), noise.g, noise.lags)
     parts = (noise.lags, ar, noise.g)
-    whole = estimated(X, y, parts, breaks)[1]
+    whole = estimated(X, y, parts, breaks)[1] if K else 0.0
     for k in range(K):
         place, rss, theta = profile(model, ar, breaks, k, max(n + 1, first + 1, 3))
         rss += max(whole - rss[place == breaks[k]][0], 0.0)
@@ -203,15 +203,13 @@ def dated(
         spans[k] = min(inside[0], breaks[k]), max(inside[1], breaks[k])
         theta = theta @ model.basis.T
         moved[k : k + 2] += np.einsum("m,mkj->kj", weight, (theta - np.einsum("m,mkj->kj", weight, theta)) ** 2)
-    edges = [(0, N), *_certain(breaks, spans, N, n)]
-    known = [_directions(model, a, b) for a, b in edges]
-    rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
+    certain = _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
+    found = [informed(model.phi[first:last]) for first, last in certain]
+    later = zip(np.split(split(X, breaks), K + 1, axis=1)[1:], found[1:], strict=True)
+    rows = np.hstack([X, *(part @ _projector(model, directions) for part, (_, directions) in later)])
     theta, left = estimated(X, y, parts, breaks, rows)
     std = _errors(model, rows, parts, moved)
-    unknown = [
-        undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
-    ]
-    std[np.array(unknown)] = np.inf
+    std[np.array([unknown for unknown, _ in found])] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, moved, ar, left, prices)
 
 
@@ -242,27 +240,24 @@ def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int
     return found
 
 
-def _directions(model: Model, first: int, last: int) -> Array:
-    """The projector (n, n), in the basis, on changes of what rows first .. last determine."""
-    n = model.X.shape[1]
-    basis = orthonormal(model.phi[first:last])
-    size, directions = np.linalg.svd(basis.R)[1:]
-    kept = directions[size > basis.negligible]
-    if len(kept) == n:
-        return np.eye(n)
-    scale = orthonormal(model.phi).size
-    own = kept * (basis.size / scale)
-    Q = np.linalg.qr(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))[0]
-    return np.asarray(Q @ Q.T)
-
-
 COMPONENT = 1e-6
 """Smallest component, in units of the regressors, that a direction has in a parameter."""
 
 
-def undetermined(phi: Array) -> Array:
-    """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in."""
+def informed(phi: Array) -> tuple[Array, Array]:
+    """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in, and the directions
+    (r, n) of the coefficients of the combinations that they do vary in."""
     basis = orthonormal(phi)
-    _, size, directions = np.linalg.svd(basis.R)
+    size, directions = np.linalg.svd(basis.R)[1:]
     rank = int(np.sum(size > basis.negligible))
-    return np.asarray(np.linalg.norm(directions[rank:], axis=0) > COMPONENT)
+    return np.linalg.norm(directions[rank:], axis=0) > COMPONENT, directions[:rank] * basis.size
+
+
+def _projector(model: Model, directions: Array) -> Array:
+    """The projector (n, n), in the basis, on changes of what rows of these directions determine."""
+    if len(directions) == model.X.shape[1]:
+        return np.eye(model.X.shape[1])
+    scale = orthonormal(model.phi).size
+    own = np.linalg.qr((directions / scale).T)[0]
+    Q = np.linalg.qr(np.linalg.solve(model.basis, own / scale[:, None]))[0]
+    return np.asarray(Q @ Q.T)

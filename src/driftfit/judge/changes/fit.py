@@ -13,16 +13,15 @@ is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.changes.scan import SINGULAR, SMALL, problem_of, searched
-from driftfit.judge.statistics.robust import deviation, eliminate, robust_fit
-from driftfit.judge.statistics.whiteness import loudest
+from driftfit.judge.changes.scan import SINGULAR, problem_of, searched
+from driftfit.judge.statistics.robust import ROUNDED, SMALL, Basis, deviation, eliminate, fit_in, invertible
+from driftfit.judge.statistics.whiteness import loudest, ranks
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
@@ -37,8 +36,6 @@ SEASON = 24
 ROUNDS = 4
 KNOTS = (3, 5, 9, 17, 33)
 """Knots of lines that parameters may move on."""
-ROUNDED = 1e-14
-"""Information below this share of that of the whole record is rounding."""
 MOST = 12
 """Largest number of breaks."""
 WINDOWS = 12
@@ -89,13 +86,6 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
-def invertible(G: Array, share: Array | float = ROUNDED) -> Array:
-    """Sums of products G (.., q, q), with this share of the mean of their diagonal beside their own."""
-    q = G.shape[-1]
-    mean = np.trace(G, axis1=-2, axis2=-1)[..., None, None] / q
-    return np.asarray(G + (mean * share + SMALL) * np.eye(q))
-
-
 def coefficients(Z: Array, z: Array, share: Array | float = ROUNDED) -> Array:
     """Least squares (q,) of z (N,) on columns Z (N, q)."""
     return np.linalg.solve(invertible(Z.T @ Z, share), Z.T @ z)
@@ -131,9 +121,9 @@ def noise_of(X: Array, y: Array, theta: Array, breaks: Array) -> Array:
 def regressed(v: Array, g: Array, lags: Array) -> Array:
     """Autoregression (p,) of v (N,)."""
     first = order_of(lags)
-    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else np.zeros((len(v), 0))
+    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else NONE
     w = g[first:]
-    return np.asarray(np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0])
+    return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
 def _choose(v: Array, ok: Array, most: int, row: Array, G: Array, chosen: Array) -> None:
@@ -197,10 +187,14 @@ def level_of(e: Array, first: int) -> Array:
     s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
     m = max(3, min(WINDOWS, N // 20))
     edges = np.linspace(first, N, m + 1).astype(int)
-    parts = [np.sort(np.abs(e[a:b])) for a, b in pairwise(edges)]
-    middles = (0.5 * (part[(len(part) - 1) // 2] + part[len(part) // 2]) for part in parts)  # as `np.median`, faster
-    held = (np.minimum(part, HELD * max(MEDIAN * float(x), 0.05 * s)) for part, x in zip(parts, middles, strict=True))
-    own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
+    count = np.diff(edges)
+    parts = np.full((m, count.max()), np.inf)
+    parts[np.arange(count.max()) < count[:, None]] = np.abs(used)
+    parts.sort(axis=1)
+    middle = 0.5 * (parts[np.arange(m), (count - 1) // 2] + parts[np.arange(m), count // 2])
+    limit = HELD * np.maximum(MEDIAN * middle, 0.05 * s)[:, None]
+    square = np.sum(np.where(np.isfinite(parts), np.minimum(parts, limit), 0.0) ** 2, axis=1) / count
+    own = np.log(np.maximum(np.sqrt(square), 0.05 * s))
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
     middle = float(np.median(own))
@@ -297,12 +291,13 @@ def weights(e: Array, level: Array) -> Array:
     return np.asarray(HELD / np.maximum(np.abs(e) / level, HELD) / level)
 
 
-def spread(e: Array, phi: Array) -> Array:
-    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n) with which residuals e (N,) grow, if they clearly do.
+def spread(e: Array, phi: Array, ranked: Array) -> Array:
+    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n), whose `ranks` are known, with which residuals e (N,) grow, if
+    they clearly do.
 
     The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
     """
-    most = loudest(e, phi)
+    most = loudest(e, ranked)
     if most is None:
         return np.ones(len(e))
     A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
@@ -319,10 +314,10 @@ def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int 
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
     lags = NONE if order is None else np.arange(1, order + 1)
-    constants = robust_fit(X, y)
+    constants, ranked = fit_in(Basis(X, np.eye(n), np.ones(n)), y), ranks(phi)
     e = constants.residual
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
-    level *= spread(e / level, phi)
+    level *= spread(e / level, phi, ranked)
     g = weights(e, level)
     for _ in range(2):
         if order is None:
@@ -334,7 +329,7 @@ def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int 
         first = order_of(lags)
         v = y - rows @ coefficients(Z, z)
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
-        size = spread(e, phi)
+        size = spread(e, phi, ranked)
         level = size * level_of(e / size, first)
         g = weights(e, level)
     return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))

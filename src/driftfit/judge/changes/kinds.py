@@ -26,10 +26,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import coefficients, hats, invertible, left, order_of, split, white_rows
+from driftfit.judge.changes.fit import coefficients, hats, left, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SINGULAR, SMALL
+from driftfit.judge.changes.scan import SINGULAR
 from driftfit.judge.changes.which import Which
+from driftfit.judge.statistics.robust import SMALL, invertible
 
 KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
 CORNERS = 24

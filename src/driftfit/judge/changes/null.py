@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, invertible, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Recursion, Results, draw
-from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
-from driftfit.judge.statistics.robust import orthonormal
+from driftfit.judge.changes.scan import Found, Problem, Work, problem_of, searched
+from driftfit.judge.statistics.robust import SMALL, invertible, orthonormal
 
 DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""

@@ -21,12 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.statistics.robust import eliminate, solved
+from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
 """Information below this share of that of the whole record is none."""
-SMALL = 1e-300
-"""Added to a diagonal, so that it can be inverted."""
 CELLS = 32
 """Cells at whose ends breaks are compared."""
 FINER = 8

@@ -19,6 +19,10 @@ from driftfit.engine.kernel import Array, shared
 from driftfit.smooth.parts.rank import column_sizes
 
 CLIP = 1.5
+SMALL = 1e-300
+"""Added to a diagonal, so that it can be inverted."""
+ROUNDED = 1e-14
+"""Information below this share of that of the whole record is rounding."""
 ROUNDS = 30
 SHRINKING = 0.9
 """A scale that in the last round is below this share of the one before vanishes."""
@@ -59,8 +63,8 @@ class Fit(NamedTuple):
 
 @shared
 def eliminate(M: Array, n: int, least: float) -> float:
-    """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal and D^-1 on
-    it. Returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
+    """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal, D^-1 on
+    it; returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
 
     With n = k - 1 and M = [phi, y]' [phi, y] that entry is the sum of squared residuals.
     """
@@ -112,6 +116,13 @@ class Basis(NamedTuple):
         return bool(np.linalg.matrix_rank(self.R, self.negligible) == len(self.size))
 
 
+def invertible(G: Array, share: Array | float = ROUNDED) -> Array:
+    """Sums of products G (.., q, q), with this share of the mean of their diagonal beside their own."""
+    q = G.shape[-1]
+    mean = np.einsum("...ii->...", G)[..., None, None] / q
+    return np.asarray(G + (mean * share + SMALL) * np.eye(q))
+
+
 def orthonormal(phi: Array) -> Basis:
     """An orthonormal basis of regressors phi (N, n), N > 0."""
     size, root = column_sizes(phi), np.sqrt(len(phi))
@@ -142,7 +153,7 @@ def fit_in(basis: Basis, y: Array) -> Fit:
     level = ROUNDING * float(np.sqrt(np.mean(y * y)))
     for round in range(ROUNDS):
         W = Q.T * weight
-        step = np.linalg.lstsq(W @ Q, W @ y, rcond=FLAT)[0]
+        step = np.linalg.solve(invertible(W @ Q), W @ y)
         moved, theta, residual = float(np.abs(Q @ (step - theta)).max()), step, y - Q @ step
         before, scale = scale, deviation(residual)
         vanished = round > 0 and not scale > level
