@@ -20,7 +20,7 @@ import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.scan import SINGULAR, problem_of, searched
-from driftfit.judge.statistics.robust import ROUNDED, SMALL, Basis, deviation, eliminate, fit_in, invertible
+from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible
 from driftfit.judge.statistics.whiteness import loudest, ranks
 
 NONE = np.zeros(0, np.int64)
@@ -69,6 +69,13 @@ def shortest(n: int, lags: Array, given: int | None = None) -> int:
 def order_of(lags: Array) -> int:
     """The last lag; 0 if there is none."""
     return int(lags[-1]) if len(lags) else 0
+
+
+def complete(ok: Array, lags: Array) -> Array:
+    """Indices of the rows that are ``ok`` (N,), as are all their lags."""
+    at = np.flatnonzero(ok)
+    at = at[at >= order_of(lags)]
+    return np.asarray(at[ok[at[:, None] - lags].all(axis=1)])
 
 
 def white_rows(X: Array, y: Array, lags: Array, ar: Array, g: Array) -> tuple[Array, Array]:
@@ -126,22 +133,24 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
-def _choose(v: Array, ok: Array, most: int, row: Array, G: Array, chosen: Array) -> None:
-    """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses; sums of products to G (k, k) of
-    the lags 1 .. k - 1 and of v (N,) itself, where all of them are ``ok``."""
-    last, N, count = G.shape[0] - 1, v.shape[0], 0
-    for t in range(last, N):
-        whole = True
-        for i in range(last + 1):
-            whole = whole and ok[t - i]
-            row[i - 1 if i > 0 else last] = v[t - i]
-        if whole:
-            count += 1
-            for i in range(last + 1):
-                for j in range(i + 1):
-                    G[i, j] += row[i] * row[j]
-    if count <= 2 * last:
-        return
+def _multiply(v: Array, G: Array) -> None:
+    """G (k, k), a lower triangle: sums of products of v (N,) with the lags 1 .. k - 1, and last of v itself, from row
+    k - 1 on; those of two lags follow from those of one less each."""
+    last, N = G.shape[0] - 1, v.shape[0]
+    for i in range(last + 1):
+        for t in range(last, N):
+            G[last, i - 1 if i > 0 else last] += v[t] * v[t - i]
+        for j in range(1, last + 1 - i):
+            before = G[i + j - 2, j - 2] if j > 1 else G[last, i - 1 if i > 0 else last]
+            G[i + j - 1, j - 1] = before + v[last - i - j] * v[last - j] - v[N - i - j] * v[N - j]
+
+
+_multiplied = Driver(_multiply)
+
+
+def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
+    """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
+    last = G.shape[0] - 1
     for i in range(last + 1):
         G[i, i] += SINGULAR * G[i, i] + SMALL
     eliminate(G, most, 0.0)
@@ -176,9 +185,19 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
         return NONE
     longest, found = max(most, min(season, N // 12)), np.zeros(2, np.int64)
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
-    ok = np.ones(N, bool) if ok is None else ok
-    _chosen(v, ok, most, np.empty(longest + 1), np.zeros((longest + 1, longest + 1)), found)
-    return np.append(np.arange(1, found[0] + 1), found[found[1:].nonzero()[0] + 1])
+    if ok is None:
+        count, G = N - longest, np.zeros((longest + 1, longest + 1))
+        if count > 2 * longest:
+            _multiplied(v, G)
+    else:
+        at = complete(ok, np.arange(1, longest + 1))
+        rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
+        count, G = len(at), rows.T @ rows
+    if count <= 2 * longest:
+        return NONE
+    _chosen(G, count, most, found)
+    lags = np.arange(1, found[0] + 1)
+    return np.append(lags, found[1]) if found[1] else lags
 
 
 def level_of(e: Array, first: int) -> Array:
@@ -292,8 +311,8 @@ def weights(e: Array, level: Array) -> Array:
 
 
 def spread(e: Array, phi: Array, ranked: Array) -> Array:
-    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n), whose `ranks` are known, with which residuals e (N,) grow, if
-    they clearly do.
+    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n), whose `ranks` are known, with which residuals e (N,)
+    grow, if they clearly do.
 
     The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
     """
@@ -309,13 +328,12 @@ def spread(e: Array, phi: Array, ranked: Array) -> Array:
     return np.asarray(np.sqrt(size / np.median(size)))
 
 
-def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int | None = None) -> Noise:
-    """The noise of y (N,) on X (N, n), X' X = N I, which are phi in a basis; of some ``order`` if that is given."""
+def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = None, fewest: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), phi in a basis, whose constants are known; of some ``order`` if it is given."""
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
     lags = NONE if order is None else np.arange(1, order + 1)
-    constants, ranked = fit_in(Basis(X, np.eye(n), np.ones(n)), y), ranks(phi)
-    e = constants.residual
+    e, ranked = constants.residual, ranks(phi)
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
     level *= spread(e / level, phi, ranked)
     g = weights(e, level)

@@ -58,12 +58,10 @@ class Kind(NamedTuple):
     """Of a drift with jumps, the dates that it needs."""
 
 
-def _filter(
-    H: Array, steps: Array, columns: Array, state: Array, P: Array, gain: Array, row: Array, products: Array,
-    totals: Array,
-) -> None:  # fmt: skip
+def _filter(H: Array, steps: Array, columns: Array, scratch: tuple[Array, ...], products: Array, totals: Array) -> None:
     """Of a walk on H (N, J), known at the start, in noise of variance 1, for steps of each variance (S,): sums of
     products (S, c, c) of the innovations of columns (N, c) over their deviation, and the sum of log f to totals."""
+    state, P, gain, row = scratch
     N, J = H.shape
     for s in range(steps.shape[0]):
         for i in range(J):
@@ -104,10 +102,8 @@ def innovations(H: Array, steps: Array, columns: Array) -> tuple[Array, Array]:
     """Sums of products (S, c, c) of the innovations of columns (N, c), and the sums (S,) of log f, by steps (S,)."""
     J, c, S = H.shape[1], columns.shape[1], len(steps)
     products, totals = np.zeros((S, c, c)), np.zeros(S)
-    _filtered(
-        np.ascontiguousarray(H), steps, columns, np.zeros((J, c)), np.zeros((J, J)), np.zeros(J), np.zeros(c), products,
-        totals,
-    )  # fmt: skip
+    scratch = np.zeros((J, c)), np.zeros((J, J)), np.zeros(J), np.zeros(c)
+    _filtered(np.ascontiguousarray(H), steps, columns, scratch, products, totals)
     return products, totals
 
 

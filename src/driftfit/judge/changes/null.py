@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, coefficients, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Recursion, Results, draw
 from driftfit.judge.changes.scan import Found, Problem, Work, problem_of, searched
-from driftfit.judge.statistics.robust import SMALL, invertible, orthonormal
+from driftfit.judge.statistics.robust import SMALL, Basis, Fit, invertible
 
 DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
@@ -113,21 +113,26 @@ class Model(NamedTuple):
 
 
 def modelled(
-    phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
-) -> Model:
-    """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
+    phi: Array, basis: Basis, y: Array, constants: Fit, lags: Lags | None = None, root: Array | None = None,
+    order: int | None = None, fewest: int | None = None,
+) -> Model:  # fmt: skip
+    """The regression of y (N,) on phi (N, n), of which basis and constants are known, with its noise.
+
+    ``lags``: which columns are earlier outputs; None if none is. ``root`` (N,): what rows were multiplied by; None for
+    1. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows in a segment.
+    """
     N = len(y)
     lags = Lags(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0))) if lags is None else lags
     root = np.ones(N) if root is None else root
-    X, R, size = orthonormal(phi)
-    basis = np.linalg.inv(R) / size[:, None]
-    offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
+    X, R, size = basis
+    inverse = np.linalg.inv(R) / size[:, None]
+    offset = inverse @ (X.T @ y / N)
     rounding = ROUNDING * np.abs(y)
-    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
-    found = noise(X, y, phi, order, fewest)
-    r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
+    phi, y, inverse = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, inverse))
+    found = noise(X, y, phi, constants, order, fewest)
+    r = (y - X @ coefficients(X * found.g[:, None], y * found.g)) * found.g
     floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
-    return Model(phi, y, offset, X, basis, lags, root, found, floor)
+    return Model(phi, y, offset, X, inverse, lags, root, found, floor)
 
 
 def radius(a: Array, lags: Array) -> float:
@@ -135,6 +140,8 @@ def radius(a: Array, lags: Array) -> float:
     p = order_of(lags)
     if not p:
         return 0.0
+    if p == 1:
+        return float(abs(a[0]))
     companion = np.eye(p, k=-1)
     companion[0, lags - 1] = a
     return float(np.abs(np.linalg.eigvals(companion)).max())
