@@ -78,8 +78,5 @@ def normal_limit(rho: float, every: float) -> float:
         inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * scipy.special.ndtr((rho * x - c) / spread)
         return float(np.trapezoid(inside, x))
 
-    low, high = STILL, FAR
-    while high - low > 1e-9 and begins(low) > 1.0 / every:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if begins(middle) > 1.0 / every else (low, middle)
-    return low
+    rate = max(1.0 / every, begins(FAR))
+    return STILL if begins(STILL) <= rate else float(scipy.optimize.brentq(lambda c: begins(c) - rate, STILL, FAR))

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
-from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
+from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price
 from driftfit.judge.changes.scan import SINGULAR, add
 from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
 
@@ -164,7 +164,7 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
         breaks, ar = test.breaks[K], test.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
-        if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
+        if draws.root(mean, ar) < 1.0:
             K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
     return test.breaks[K], test.ar[K], prices
 

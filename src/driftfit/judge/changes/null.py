@@ -56,8 +56,8 @@ class Lags(NamedTuple):
     @property
     def delays(self) -> Array:
         """(k,): by how many rows each is earlier."""
-        known = [np.flatnonzero(one >= 0)[-1] for one in self.source.T]
-        return np.array([row - source[row] for row, source in zip(known, self.source.T, strict=True)], np.int64)
+        last = [np.flatnonzero(source >= 0)[-1] for source in self.source.T]
+        return np.array(last, np.int64) - self.source[last, np.arange(len(last))]
 
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
@@ -90,7 +90,7 @@ class Tested(NamedTuple):
     theta: Array
     """(n,): constants, in units of the model."""
     root: float
-    """Largest root of the dynamics: of the lags of the output, and of the noise."""
+    """`Draws.root`"""
 
 
 class Model(NamedTuple):
@@ -181,8 +181,7 @@ class Draws:
 
     def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
         """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
-        columns, lags = self.model.lags.columns, self.problem.lags
-        if not len(columns) and not len(lags):
+        if not len(self.model.lags.columns) and not len(ar):
             return theta, ar
         drawn = self.of(theta, ar, BIASED, False)
         shift = np.median(drawn.theta @ self.model.basis.T, axis=0)
@@ -191,20 +190,16 @@ class Draws:
             return theta, ar
         for share in np.linspace(1.0, 0.0, 21):
             moved, less = theta - share * shift, ar - share * turn
-            if max(self.of_outputs(moved), radius(less, lags)) <= UNIT:
+            if self.root(moved, less) <= UNIT:
                 return moved, less
         return theta, ar
 
-    def of_outputs(self, theta: Array) -> float:
-        """Largest root of the lags of the output."""
+    def root(self, theta: Array, ar: Array) -> float:
+        """Largest root of the dynamics: of the lags of the output, and of the noise."""
         back = self.model.lags
-        if not len(back.columns):
-            return 0.0
         lags = back.delays
-        order, last = np.argsort(lags), [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
-        ratio = back.ratio[last, np.arange(len(last))]
-        theta = theta + self.model.offset
-        return radius((theta[back.columns] * ratio)[order], lags[order])
+        own = (theta + self.model.offset)[back.columns][np.argsort(lags)]
+        return max(radius(own, np.sort(lags)), radius(ar, self.problem.lags))
 
 
 def p_of(x: float, drawn: Array) -> float:
@@ -268,10 +263,9 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
-    root = max(draws.of_outputs(theta), radius(ar, noise.lags))
     dates = tuple(found.at[k, :k] for k in range(most + 1))
     constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, draws.root(theta, ar)), draws
 
 
 def gains(rss: Array, N: int) -> Array:

@@ -130,6 +130,12 @@ def orthonormal(phi: Array) -> Basis:
     return Basis(np.ascontiguousarray(Q * root), R / root, size)
 
 
+def pseudo_inverse(phi: Array) -> Array:
+    """The pseudo-inverse (n, N) of regressors phi (N, n), whose units may be far apart."""
+    basis = orthonormal(phi)
+    return np.asarray(np.linalg.pinv(basis.R, basis.negligible) / basis.size[:, None] @ basis.Q.T / len(phi))
+
+
 def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
     return fit_in(orthonormal(phi), y)
