@@ -38,7 +38,7 @@ from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
-from driftfit.judge.statistics.whiteness import loudest, ranks
+from driftfit.judge.statistics.whiteness import loudest
 from driftfit.readings.gate import FROZEN
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.text import Printed, digits, facts, table_of
@@ -383,7 +383,7 @@ def judged(known: Evidence) -> Verdict:
     error, *others = (rounded(each[scored], run.y[scored]) for each in known.errors[:-1])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
-    loud = None if found is None or found.rejected else loudest(found.model.noise.e, ranks(found.model.phi))
+    loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.noise.ranks)
     return Verdict(
         drifts=None if found is None else found.rejected,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),

@@ -204,12 +204,13 @@ def dated(
         theta = theta @ model.basis.T
         moved[k : k + 2] += np.einsum("m,mkj->kj", weight, (theta - np.einsum("m,mkj->kj", weight, theta)) ** 2)
     certain = _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
-    found = [informed(model.phi[first:last]) for first, last in certain]
+    found = [informed(model.phi[first:last]) for first, last in certain] if K else []
     later = zip(np.split(split(X, breaks), K + 1, axis=1)[1:], found[1:], strict=True)
     rows = np.hstack([X, *(part @ _projector(model, directions) for part, (_, directions) in later)])
     theta, left = estimated(X, y, parts, breaks, rows)
     std = _errors(model, rows, parts, moved)
-    std[np.array([unknown for unknown, _ in found])] = np.inf
+    for k, (unknown, _) in enumerate(found):
+        std[k, unknown] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, moved, ar, left, prices)
 
 

@@ -34,6 +34,8 @@ ORDER = 6
 """Largest order of the autoregression; a season may add one further lag."""
 SEASON = 24
 ROUNDS = 4
+SETTLED = 0.1
+"""Standard deviation of the logarithm of a change of weights after which segments and lags are searched again."""
 KNOTS = (3, 5, 9, 17, 33)
 """Knots of lines that parameters may move on."""
 MOST = 12
@@ -59,6 +61,8 @@ class Noise(NamedTuple):
     """(N, q): the regressors of these."""
     fewest: int
     """Rows in the shortest segment that is searched."""
+    ranks: Array
+    """(N, n): those of the sizes of the regressors."""
 
 
 def shortest(n: int, lags: Array, given: int | None = None) -> int:
@@ -328,26 +332,33 @@ def spread(e: Array, phi: Array, ranked: Array) -> Array:
     return np.asarray(np.sqrt(size / np.median(size)))
 
 
+def _structure(
+    X: Array, y: Array, g: Array, order: int | None, most: int, fewest: int | None
+) -> tuple[Array, Array, Array]:
+    """(lags, ar, regressors of the path) for these weights; the lags are those of an ``order`` that is given."""
+    if order is None:
+        return together(X, y, g, min(ORDER, len(y) // 20), most, fewest)
+    lags = np.arange(1, order + 1)
+    breaks, ar, _ = divided(X, y, lags, g, most, fewest)
+    return lags, ar, split(X, breaks)
+
+
 def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = None, fewest: int | None = None) -> Noise:
     """The noise of y (N,) on X (N, n), phi in a basis, whose constants are known; of some ``order`` if it is given."""
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
-    lags = NONE if order is None else np.arange(1, order + 1)
     e, ranked = constants.residual, ranks(phi)
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
     level *= spread(e / level, phi, ranked)
     g = weights(e, level)
-    for _ in range(2):
-        if order is None:
-            lags, ar, rows = together(X, y, g, min(ORDER, N // 20), most, fewest)
-        else:
-            breaks, ar, _ = divided(X, y, lags, g, most, fewest)
-            rows = split(X, breaks)
-        Z, z = white_rows(rows, y, lags, ar, g)
+    lags, ar, rows = _structure(X, y, g, order, most, fewest)
+    for last in (False, True):
         first = order_of(lags)
-        v = y - rows @ coefficients(Z, z)
+        v = y - rows @ coefficients(*white_rows(rows, y, lags, ar, g))
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         size = spread(e, phi, ranked)
         level = size * level_of(e / size, first)
-        g = weights(e, level)
-    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))
+        before, g = g, weights(e, level)
+        if not last and np.std(np.log(g / before)) > SETTLED:
+            lags, ar, rows = _structure(X, y, g, order, most, fewest)
+    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest), ranked)

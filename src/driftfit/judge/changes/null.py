@@ -184,8 +184,9 @@ class Draws:
         if not len(self.model.lags.columns) and not len(ar):
             return theta, ar
         drawn = self.of(theta, ar, BIASED, False)
-        shift = np.median(drawn.theta @ self.model.basis.T, axis=0)
-        turn = np.median(drawn.ar, axis=0) - ar
+        half = slice((BIASED - 1) // 2, BIASED // 2 + 1)  # the median
+        shift = np.sort(drawn.theta @ self.model.basis.T, axis=0)[half].mean(axis=0)
+        turn = np.sort(drawn.ar, axis=0)[half].mean(axis=0) - ar
         if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
             return theta, ar
         for share in np.linspace(1.0, 0.0, 21):

@@ -77,8 +77,9 @@ def loudest(z: Array, ranked: Array) -> int | None:
 
 def ranks(phi: Array) -> Array:
     """Ranks (N, n) of the sizes of every regressor of phi (N, n), equal ones for equal sizes, about their mean."""
-    x = scipy.stats.rankdata(np.abs(phi), axis=0) / len(phi)
-    return np.asarray(x - x.mean(axis=0))
+    sizes = [(one, np.sort(one)) for one in np.abs(phi).T]
+    x = [np.searchsorted(known, one, "left") + np.searchsorted(known, one, "right") for one, known in sizes]
+    return np.asarray((np.array(x) - np.mean(x, axis=1, keepdims=True)).T / (2.0 * len(phi)))
 
 
 def grows_with(z: Array, ranked: Array) -> Array:
