@@ -21,7 +21,7 @@ from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
-from driftfit.judge.structures.candidates import shares
+from driftfit.judge.structures.candidates import weigh
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 
@@ -40,8 +40,9 @@ def density(e: Array) -> Array:
 
 def weights(first: Array, second: Array) -> Array:
     """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,)."""
-    ratio = np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0))[:, None]
-    return shares(ratio, np.ones(ratio.shape, bool), np.zeros(1, np.int64))[:, 0]
+    ratio, weight = np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0))[:, None], np.empty((len(first), 1))
+    weigh(ratio, np.ones(weight.shape, bool), np.zeros(1, np.int64), weight)
+    return weight[:, 0]
 
 
 def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:

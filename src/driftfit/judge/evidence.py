@@ -11,7 +11,7 @@ from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.changes import Changes, changes
 from driftfit.judge.changes.dates import LEVEL
-from driftfit.judge.changes.null import modelled, tested
+from driftfit.judge.changes.null import modelled
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
@@ -39,12 +39,6 @@ def _testable(rows: Rows) -> tuple[Basis, Array, Fit] | None:
     y = rows.y if rows.step is None else drawn_within(basis.Q, rows.y, rows.step)
     fit = fit_in(basis, y)
     return (basis, y, fit) if noisy(fit, rows.phi, y) else None
-
-
-def p_of_constants(rows: Rows) -> float:
-    """p-value of constants, NaN if they cannot be tested: `judged_rows` without dates and kinds."""
-    known = _testable(rows)
-    return float("nan") if known is None else tested(modelled(rows.phi, *known, rows.lags, rows.root))[0].p
 
 
 def judged_rows(

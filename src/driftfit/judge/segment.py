@@ -33,7 +33,7 @@ from driftfit.engine.settings import whole
 from driftfit.judge.changes.dates import informed
 from driftfit.judge.changes.fit import NONE
 from driftfit.judge.changes.fit import shortest as shortest_of
-from driftfit.judge.changes.words import clauses, events
+from driftfit.judge.changes.words import clause, events
 from driftfit.judge.evidence import REJECTED, judged_rows
 from driftfit.judge.regressors import refuse_hidden, regressors
 from driftfit.judge.statistics.robust import orthonormal, pseudo_inverse
@@ -245,7 +245,7 @@ def segmented(run: Track, level: float = 0.95, false: float = REJECTED, shortest
     spans = rows.at[found.spans]
     breaks = tuple(Break(time[t], time[first], time[last], int(t)) for t, (first, last) in zip(at, spans, strict=True))
     other = changes.rejected and changes.kind.name != "steps"
-    better = "; ".join(clauses(events(changes, run.model.names, rows.at, run.time_text))) if other else ""
+    better = "; ".join(map(clause, events(changes, run.model.names, rows.at, run.time_text))) if other else ""
     noise = float(np.median(changes.model.noise.level))
     return Segmentation(breaks, parts, level, found.prices[0], noise, tuple(map(float, found.ar)), run, "", better)
 

@@ -33,7 +33,7 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.changes.changes import Changes
-from driftfit.judge.changes.words import Event, clauses, events, rows
+from driftfit.judge.changes.words import Event, clause, events, rows
 from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
@@ -217,7 +217,7 @@ class Verdict(Printed):
         )
 
     def _which(self) -> str:
-        return f"What moves: {'; '.join(clauses(self.events))}." if self.events else ""
+        return f"What moves: {'; '.join(map(clause, self.events))}." if self.events else ""
 
     def _indistinct(self) -> str:
         idle = [name for name in self.held if not any(name in group for group in self.dependent)]

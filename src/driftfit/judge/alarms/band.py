@@ -20,9 +20,9 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.reference import Reference, burn, normal_samples
+from driftfit.judge.alarms.reference import Reference, normal_samples
 from driftfit.run.live.rule import AlarmRule, check_fits
-from driftfit.run.result import Track
+from driftfit.run.result import Track, burn_in
 
 NODES, FAR = 2001, 9.0
 """Nodes of the integral, and deviations up to which it goes."""
@@ -33,7 +33,12 @@ STILL = 1.645
 def band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
     """The rule for the given bands, or for the range of the parameters in the reference; the first sample it judges."""
     if isinstance(reference, Mapping):
-        names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
+        names, (low, high), known, start = (
+            tuple(reference),
+            _edges(reference),
+            slice(burn_in(run.model.n), None),
+            burn_in(run.model.n),
+        )
     else:
         first, start = normal_samples(run, reference)
         # hidden states move with the inputs, and say nothing of a fault

@@ -275,14 +275,16 @@ def divided(
 
 
 def together(
-    X: Array, y: Array, g: Array, orders: int, most: int, given: int | None = None
+    X: Array, y: Array, g: Array, order: int | None, most: int, given: int | None = None
 ) -> tuple[Array, Array, Array]:
-    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots."""
+    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots; segments with the lags of
+    an ``order`` if that is given."""
     N, n = X.shape
     theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
     best: tuple[float, Array, Array, Array] | None = None  # criterion, lags, ar, rows
     tried: list[list[int]] = []
-    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE):
+    orders = min(ORDER, N // 20)
+    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE) if order is None else (np.arange(1, order + 1),):
         for _ in range(ROUNDS):
             if lags.tolist() in tried:
                 break
@@ -292,10 +294,10 @@ def together(
             if best is None or criterion < best[0]:
                 best = criterion, lags, ar, split(X, breaks)
             theta, _ = estimated(X, y, (lags, ar, g), breaks)
-            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders)
+            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders) if order is None else lags
     assert best is not None
     for knots in KNOTS:
-        if n * knots > N // 8:
+        if n * knots > N // 8 or order is not None:
             break
         path, r = on_lines(X * g[:, None], y * g, N, knots)
         v = y - np.einsum("tj,tj->t", X, path)
@@ -332,17 +334,6 @@ def spread(e: Array, phi: Array, ranked: Array) -> Array:
     return np.asarray(np.sqrt(size / np.median(size)))
 
 
-def _structure(
-    X: Array, y: Array, g: Array, order: int | None, most: int, fewest: int | None
-) -> tuple[Array, Array, Array]:
-    """(lags, ar, regressors of the path) for these weights; the lags are those of an ``order`` that is given."""
-    if order is None:
-        return together(X, y, g, min(ORDER, len(y) // 20), most, fewest)
-    lags = np.arange(1, order + 1)
-    breaks, ar, _ = divided(X, y, lags, g, most, fewest)
-    return lags, ar, split(X, breaks)
-
-
 def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = None, fewest: int | None = None) -> Noise:
     """The noise of y (N,) on X (N, n), phi in a basis, whose constants are known; of some ``order`` if it is given."""
     N, n = X.shape
@@ -351,7 +342,7 @@ def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = No
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
     level *= spread(e / level, phi, ranked)
     g = weights(e, level)
-    lags, ar, rows = _structure(X, y, g, order, most, fewest)
+    lags, ar, rows = together(X, y, g, order, most, fewest)
     for last in (False, True):
         first = order_of(lags)
         v = y - rows @ coefficients(*white_rows(rows, y, lags, ar, g))
@@ -360,5 +351,5 @@ def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = No
         level = size * level_of(e / size, first)
         before, g = g, weights(e, level)
         if not last and np.std(np.log(g / before)) > SETTLED:
-            lags, ar, rows = _structure(X, y, g, order, most, fewest)
+            lags, ar, rows = together(X, y, g, order, most, fewest)
     return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest), ranked)

@@ -128,12 +128,8 @@ def _wandering(changes: Changes, names: Sequence[str], at: Array) -> Event:
     return Event("wandering", int(at[0]), int(at[0]), int(at[0]), int(at[-1]), None, None, moves)
 
 
-def clauses(found: Sequence[Event]) -> list[str]:
-    """A clause for each event."""
-    return [_clause(one) for one in found]
-
-
-def _clause(event: Event) -> str:
+def clause(event: Event) -> str:
+    """An event in words."""
     if event.kind == "wandering":
         each = (f"{move.name}, in segments from {move.values[0]} to {move.values[1]}" for move in event.moves)
         return f"a random walk explains it better than steps: {'; '.join(each)}"

@@ -162,6 +162,8 @@ SHARE = 0.001
 
 
 def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
+    """Weights (T, K) of one of two predictors where both predict, from the ratio of its density to the other's (T, K);
+    both weigh the same at the ``starts`` of records."""
     T, K = ratio.shape
     now, record = np.full(K, 0.5), 0
     for t in range(T):
@@ -175,15 +177,7 @@ def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
                 now[k] = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now[k] + after)
 
 
-_weighed = Driver(_weights)
-
-
-def shares(ratio: Array, both: Array, starts: Array) -> Array:
-    """Weights (T, K) of one of two predictors where both predict, from the ratio of its density to the other's (T, K),
-    0 elsewhere; both weigh the same at the ``starts`` of records."""
-    weight = np.zeros(ratio.shape)
-    _weighed(ratio, both, starts, weight)
-    return weight
+weigh = Driver(_weights)
 
 
 def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
@@ -194,7 +188,8 @@ def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequenc
     first, second = (np.stack([p.loglik for p in found], axis=1) for found in (ones, others))
     both = np.isfinite(first) & np.isfinite(second)
     ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
-    weight = np.where(np.isfinite(first), shares(ratio, both, np.array([span.start for span in spans])), 1.0)
+    weight = np.where(np.isfinite(first), 0.0, 1.0)
+    weigh(ratio, both, np.array([span.start for span in spans]), weight)
     with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
         terms = np.logaddexp(
             np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),
