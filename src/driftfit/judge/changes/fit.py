@@ -231,11 +231,6 @@ def hats(N: int, knots: int) -> Array:
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
-def lined(X: Array, knots: int) -> Array:
-    """(N, n knots): regressors X (N, n) of parameters on continuous lines between evenly spaced knots."""
-    return np.asarray((hats(len(X), knots)[:, :, None] * X[:, None, :]).reshape(len(X), -1))
-
-
 def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
     """Sums of products G (knots n + 1, ..) of z (M,) and of Z (M, n) times hats (M, knots): of two of these at most."""
     n, last, k = Z.shape[1], G.shape[0] - 1, 0
@@ -307,7 +302,7 @@ def together(
             _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
         criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
-            best = criterion, lags, ar, lined(X, knots)
+            best = criterion, lags, ar, np.asarray((hats(N, knots)[:, :, None] * X[:, None, :]).reshape(N, -1))
     return best[1:]
 
 

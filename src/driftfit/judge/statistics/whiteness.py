@@ -22,7 +22,7 @@ from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.statistics.robust import deviation
 
 LOUDER = 1e-3
-"""p-value of residuals of one size below which they grow with a regressor."""
+"""p-value, one-sided, of residuals of one size below which they grow with a regressor."""
 
 
 class Whiteness(NamedTuple):
@@ -68,13 +68,6 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
 
 
-def loudest(z: Array, ranked: Array) -> int | None:
-    """The regressor, of those with `ranks` (N, n), with which residuals z (N,) grow most clearly; None if with none."""
-    p = grows_with(z, ranked)
-    most = int(np.argmin(p))
-    return most if p[most] * len(p) < LOUDER else None
-
-
 def ranks(phi: Array) -> Array:
     """Ranks (N, n) of the sizes of every regressor of phi (N, n), equal ones for equal sizes, about their mean."""
     sizes = [(one, np.sort(one)) for one in np.abs(phi).T]
@@ -82,11 +75,12 @@ def ranks(phi: Array) -> Array:
     return np.asarray((np.array(x) - np.mean(x, axis=1, keepdims=True)).T / (2.0 * len(phi)))
 
 
-def grows_with(z: Array, ranked: Array) -> Array:
-    """p-values (n,), one-sided, of no larger residuals z (N,) where a regressor with `ranks` (N, n) is larger; 1 for
-    those of constant size."""
+def loudest(z: Array, ranked: Array) -> int | None:
+    """The regressor, of those with `ranks` (N, n), with which residuals z (N,) grow most clearly; None if with none."""
     square = clipped(z) ** 2
     d = (square - square.mean())[:, None] * ranked
     total = len(z) * newey_west(d, 0.0)
     varied = ranked.any(axis=0) & (total > 0.0)
-    return np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)
+    p = np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)
+    most = int(np.argmin(p))
+    return most if p[most] * len(p) < LOUDER else None
