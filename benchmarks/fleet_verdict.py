@@ -1,6 +1,6 @@
 """The verdict of twenty thousand series: seconds and memory.
 
-Pumps, y of one lag, the pressure before and an intercept, 400 samples each; the gain of one in ten falls by 15 %
+Pumps, y of one lag, the pressure before and an intercept, 300 samples each; the gain of one in ten falls by 15 %
 half-way. "elapsed" is the clock, which other work on the machine lengthens; "processor" the time of all cores that the
 process and those that it started used, so that half of it is the least that two cores can take. Memory is the largest
 that the process had, with the records and the results of the tracker, what of it the verdicts added, and the largest of
@@ -26,7 +26,7 @@ from driftfit import ARX, Kalman, track
 from driftfit.run.fleet import Fleet
 from driftfit.run.parallel_lanes import cores
 
-T, DRIFTING = 400, 0.1
+T, DRIFTING = 300, 0.1
 
 
 def pumps(units: int) -> pl.DataFrame:

@@ -28,7 +28,7 @@ from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
-from driftfit.judge.evidence import Evidence, p_of_constants
+from driftfit.judge.evidence import Evidence, judged_rows
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, judged
 from driftfit.models.arx import ARX
@@ -265,7 +265,8 @@ class _Task:
         if moves_besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
-            moves_besides = not p_of_constants(more.only(whole, range(more.phi.shape[1]))) >= self.level
+            besides = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
+            moves_besides = besides is None or besides.rejected
         theta, memory, own = effects(known)
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
         kind, why = self._kind(found, run, verdict, why_not.kind(moves_besides))

@@ -19,7 +19,9 @@ from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import filled, lagged
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
-from driftfit.judge.structures.candidates import SHARE
+from driftfit.judge.statistics.paired import LEAST
+from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
+from driftfit.judge.structures.candidates import weigh
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 
@@ -29,20 +31,18 @@ the difference of both halves is twice as large, times 2.8 for a test at 5 %, ti
 
 
 def density(e: Array) -> Array:
-    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first ten."""
+    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first `LEAST`."""
     known = np.isfinite(e)
     square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
-    v = np.where(count > 10, np.maximum(np.cumsum(square) - square, 1e-100) / np.maximum(count, 1), 1.0)
-    return np.where(known & (count > 10), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
+    v = np.where(count > LEAST, np.maximum(np.cumsum(square) - square, SMALL) / np.maximum(count, 1), 1.0)
+    return np.where(known & (count > LEAST), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
 
 
 def weights(first: Array, second: Array) -> Array:
     """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,)."""
-    weight, w = np.empty(len(first)), 0.5
-    for t, ratio in enumerate(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)).tolist()):
-        weight[t] = w
-        w = SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (w * ratio + 1.0 - w)
-    return weight
+    ratio, weight = np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0))[:, None], np.empty((len(first), 1))
+    weigh(ratio, np.ones(weight.shape, bool), np.zeros(1, np.int64), weight)
+    return weight[:, 0]
 
 
 def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
@@ -89,13 +89,6 @@ def parts(run: Track) -> dict[str, Array]:
     found = {what: np.array([own == what for own in of], float) for what in ("memory", "level", *run.model.input_names)}
     found["level"] += sum(np.nanmean(run.u[:, j]) * found[name] for j, name in enumerate(run.model.input_names))
     return found
-
-
-def pseudo_inverse(X: Array) -> Array:
-    """The pseudo-inverse (n, N) of regressors X (N, n), whose units may be far apart."""
-    size = np.sqrt(np.mean(X * X, axis=0))
-    size[size == 0.0] = 1.0
-    return np.asarray(np.linalg.pinv(X / size, rcond=np.finfo(float).eps * max(X.shape)) / size[:, None])
 
 
 def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
@@ -152,4 +145,4 @@ def feedback(y: Array, u: Array) -> float:
     if len(z) < FEWEST or np.ptp(z) == 0.0:
         return 0.0
     full, less = (float(np.sum((z - A @ (pseudo_inverse(A) @ z)) ** 2)) for A in (X, X[:, :4]))
-    return (less - full) / 3.0 / max(full / (len(z) - 7), 1e-300)
+    return (less - full) / 3.0 / max(full / (len(z) - 7), SMALL)

@@ -11,12 +11,12 @@ from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.changes import Changes, changes
 from driftfit.judge.changes.dates import LEVEL
-from driftfit.judge.changes.null import modelled, tested
+from driftfit.judge.changes.null import modelled
 from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
 from driftfit.judge.statistics.coarse_readings import drawn_within
-from driftfit.judge.statistics.robust import fit_in, noisy, orthonormal, sole
+from driftfit.judge.statistics.robust import Basis, Fit, fit_in, noisy, orthonormal, sole
 from driftfit.run.result import Track
 
 REJECTED = 0.05
@@ -28,8 +28,8 @@ def least_rows(n: int) -> int:
     return 4 * n + 8
 
 
-def _testable(rows: Rows) -> tuple[Array, Array] | None:
-    """(basis (N, n), outputs); None if rows are too few, do not determine every parameter, or have no noise."""
+def _testable(rows: Rows) -> tuple[Basis, Array, Fit] | None:
+    """(basis, outputs, constants); None if rows are too few, do not determine every parameter, or have no noise."""
     N, n = rows.phi.shape
     if n == 0 or least_rows(n) > N:
         return None
@@ -37,13 +37,8 @@ def _testable(rows: Rows) -> tuple[Array, Array] | None:
     if not basis.distinct or sole(basis.Q).any():
         return None
     y = rows.y if rows.step is None else drawn_within(basis.Q, rows.y, rows.step)
-    return (basis.Q, y) if noisy(fit_in(basis, y), rows.phi, y) else None
-
-
-def p_of_constants(rows: Rows) -> float:
-    """p-value of constants, NaN if they cannot be tested: `judged_rows` without dates and kinds."""
-    known = _testable(rows)
-    return float("nan") if known is None else tested(modelled(rows.phi, known[1], rows.lags, rows.root))[0].p
+    fit = fit_in(basis, y)
+    return (basis, y, fit) if noisy(fit, rows.phi, y) else None
 
 
 def judged_rows(
@@ -53,12 +48,15 @@ def judged_rows(
     known = _testable(rows)
     if known is None:
         return None
-    Q, y = known
-    found = changes(rows.phi, y, rows.lags, rows.root, level, order, dates, fewest)
+    basis, y, fit = known
+    found = changes(modelled(rows.phi, basis, y, fit, rows.lags, rows.root, order, fewest), level, dates)
     if rows.step is None or y is not rows.y or not len(found.found.breaks):
         return found
-    drawn = drawn_within(Q, y, rows.step, found.found.breaks)  # readings of segments, where constants explain none
-    return found if drawn is y else changes(rows.phi, drawn, rows.lags, rows.root, level, order, dates, fewest)
+    y = drawn_within(basis.Q, y, rows.step, found.found.breaks)  # readings of segments, where constants explain none
+    if y is rows.y:
+        return found
+    fit = fit_in(basis, y)
+    return changes(modelled(rows.phi, basis, y, fit, rows.lags, rows.root, order, fewest), level, dates)
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,6 @@ BATCH = 0.2
 """Seconds of work that are sent to a process at once."""
 
 SERVE = "from driftfit.judge.on_all_cores import serve; serve()"
-LENGTH = 8
-"""Bytes of the number before each message, its length."""
 
 
 def on_all_cores(
@@ -129,8 +127,8 @@ class Processes:
         """``judge(*arguments)`` for each entry of the batch, in an idle process, or here if that fails."""
         process = self._idle.get()
         try:
-            _send(_open(process.stdin), pickle.dumps((judge, batch), pickle.HIGHEST_PROTOCOL))
-            found = pickle.loads(_received(_open(process.stdout)))
+            _send(_open(process.stdin), (judge, batch))
+            found = pickle.loads(pickle.load(_open(process.stdout)))
         except (OSError, EOFError, pickle.PickleError, AttributeError, TypeError):
             found = None
         finally:
@@ -145,14 +143,14 @@ def serve() -> None:
     os.dup2(2, 1)  # what a model prints does not mix with the answers
     while True:
         try:
-            message = _received(sys.stdin.buffer)
+            message = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
         try:
             judge, batch = pickle.loads(message)
-            answer = pickle.dumps([judge(*arguments) for arguments in batch], pickle.HIGHEST_PROTOCOL)
+            answer = [judge(*arguments) for arguments in batch]
         except Exception:
-            answer = pickle.dumps(None)
+            answer = None
         _send(answers, answer)
 
 
@@ -161,15 +159,7 @@ def _open(stream: IO[bytes] | None) -> IO[bytes]:
     return stream
 
 
-def _send(stream: Any, message: bytes) -> None:
-    stream.write(len(message).to_bytes(LENGTH, "little"))
-    stream.write(message)
+def _send(stream: IO[bytes], what: Any) -> None:
+    """A pickle within a pickle: what cannot be read from it leaves the stream where the next one begins."""
+    pickle.dump(pickle.dumps(what, pickle.HIGHEST_PROTOCOL), stream, pickle.HIGHEST_PROTOCOL)
     stream.flush()
-
-
-def _received(stream: Any) -> bytes:
-    length = stream.read(LENGTH)
-    if len(length) < LENGTH:
-        raise EOFError
-    message: bytes = stream.read(int.from_bytes(length, "little"))
-    return message

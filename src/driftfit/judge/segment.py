@@ -30,13 +30,13 @@ from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.changes.dates import undetermined
+from driftfit.judge.changes.dates import informed
 from driftfit.judge.changes.fit import NONE
 from driftfit.judge.changes.fit import shortest as shortest_of
-from driftfit.judge.changes.words import clauses, events
+from driftfit.judge.changes.words import clause, events
 from driftfit.judge.evidence import REJECTED, judged_rows
 from driftfit.judge.regressors import refuse_hidden, regressors
-from driftfit.judge.statistics.robust import orthonormal
+from driftfit.judge.statistics.robust import orthonormal, pseudo_inverse
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -245,7 +245,7 @@ def segmented(run: Track, level: float = 0.95, false: float = REJECTED, shortest
     spans = rows.at[found.spans]
     breaks = tuple(Break(time[t], time[first], time[last], int(t)) for t, (first, last) in zip(at, spans, strict=True))
     other = changes.rejected and changes.kind.name != "steps"
-    better = "; ".join(clauses(events(changes, run.model.names, rows.at, run.time_text))) if other else ""
+    better = "; ".join(map(clause, events(changes, run.model.names, rows.at, run.time_text))) if other else ""
     noise = float(np.median(changes.model.noise.level))
     return Segmentation(breaks, parts, level, found.prices[0], noise, tuple(map(float, found.ar)), run, "", better)
 
@@ -255,14 +255,13 @@ def _undivided(run: Track, phi: Array, y: Array, level: float, why: str) -> Segm
     N, n = phi.shape
     theta, std, spread = np.full(n, np.nan), np.full(n, np.nan), float("nan")
     if N:
-        Q, R, size = basis = orthonormal(phi)
-        inverse = np.linalg.pinv(R, basis.negligible) / size[:, None]
-        theta = inverse @ (Q.T @ y / N)
+        inverse = pseudo_inverse(phi)
+        theta = inverse @ y
         e = y - phi @ theta
         e = np.where(np.abs(e) <= ROUNDING * (np.abs(y) + np.abs(phi) @ np.abs(theta)), 0.0, e)
         spread = float(np.std(e))
         if n < N:
-            freedom = max(N - np.linalg.matrix_rank(R), 1)
-            std = np.sqrt(np.sum(inverse**2, axis=1) / N * (e @ e) / freedom)
-            std = np.where(undetermined(phi), np.inf, std)
+            unknown, directions = informed(phi)
+            std = np.sqrt(np.sum(inverse**2, axis=1) * (e @ e) / max(N - len(directions), 1))
+            std = np.where(unknown, np.inf, std)
     return Segmentation((), (Segment(0, len(run), theta, std),), level, float("nan"), spread, (), run, why)

@@ -33,7 +33,7 @@ from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.changes.changes import Changes
-from driftfit.judge.changes.words import Event, clauses, events, rows
+from driftfit.judge.changes.words import Event, clause, events, rows
 from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
@@ -217,7 +217,7 @@ class Verdict(Printed):
         )
 
     def _which(self) -> str:
-        return f"What moves: {'; '.join(clauses(self.events))}." if self.events else ""
+        return f"What moves: {'; '.join(map(clause, self.events))}." if self.events else ""
 
     def _indistinct(self) -> str:
         idle = [name for name in self.held if not any(name in group for group in self.dependent)]
@@ -383,7 +383,7 @@ def judged(known: Evidence) -> Verdict:
     error, *others = (rounded(each[scored], run.y[scored]) for each in known.errors[:-1])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
-    loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.phi)
+    loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.noise.ranks)
     return Verdict(
         drifts=None if found is None else found.rejected,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),

@@ -20,9 +20,9 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.reference import Reference, burn, normal_samples
+from driftfit.judge.alarms.reference import Reference, normal_samples
 from driftfit.run.live.rule import AlarmRule, check_fits
-from driftfit.run.result import Track
+from driftfit.run.result import Track, burn_in
 
 NODES, FAR = 2001, 9.0
 """Nodes of the integral, and deviations up to which it goes."""
@@ -33,7 +33,12 @@ STILL = 1.645
 def band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
     """The rule for the given bands, or for the range of the parameters in the reference; the first sample it judges."""
     if isinstance(reference, Mapping):
-        names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
+        names, (low, high), known, start = (
+            tuple(reference),
+            _edges(reference),
+            slice(burn_in(run.model.n), None),
+            burn_in(run.model.n),
+        )
     else:
         first, start = normal_samples(run, reference)
         # hidden states move with the inputs, and say nothing of a fault
@@ -78,8 +83,5 @@ def normal_limit(rho: float, every: float) -> float:
         inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * scipy.special.ndtr((rho * x - c) / spread)
         return float(np.trapezoid(inside, x))
 
-    low, high = STILL, FAR
-    while high - low > 1e-9 and begins(low) > 1.0 / every:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if begins(middle) > 1.0 / every else (low, middle)
-    return low
+    rate = max(1.0 / every, begins(FAR))
+    return STILL if begins(STILL) <= rate else float(scipy.optimize.brentq(lambda c: begins(c) - rate, STILL, FAR))

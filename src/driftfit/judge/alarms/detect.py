@@ -37,7 +37,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, numbers, one_of, plain, whole
 from driftfit.judge.alarms.band import band
 from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
-from driftfit.judge.alarms.reference import Reference, burn, doubt, in_samples, least, modelled, rows_of, with_offset
+from driftfit.judge.alarms.reference import Reference, doubt, in_samples, least, modelled, rows_of, with_offset
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.alarm import Change, change_of
@@ -326,7 +326,7 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None, rows: Array | 
     """Alarms of a run by a rule; ``start`` as for `detect`, ``rows`` are those of the run, if they are known."""
     check_fits(rule, run.tracker, run.names)
     if start is None:
-        start = burn(run) if run.start is None else 0
+        start = burn_in(run.model.n) if run.start is None else 0
     findings, unseen = np.zeros((0, 0)), 0
     if rule.kind == "band":
         columns = rule.columns(run.names)

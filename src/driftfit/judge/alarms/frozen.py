@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import ROUNDING, SMALLEST
+from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.changes.fit import HELD, ORDER, complete, lags_of, regressed
 from driftfit.judge.statistics.robust import CLIP as OF_FIT
 from driftfit.judge.statistics.robust import deviation, noisy, robust_fit
 from driftfit.run.live.reference_model import (
@@ -52,7 +53,6 @@ CLIPS = (2.5, 3.0, 3.5, 4.0)
 """Scores are residuals clipped at one of these numbers of scales."""
 LOUDER = 1.5
 """The factor of the noise that scores should show as soon as possible."""
-ORDER, COMPLETE = 6, 60
 ROUNDS = 3
 FAULTY = 30.0
 """Deviations from which on a residual of the reference is a fault code."""
@@ -113,7 +113,7 @@ def frozen_model(
             return None
         e = rows[:, -1] - rows[:, :-1] @ fit.theta
         ok = ok & (np.abs(e) <= FAULTY * deviation(e[ok]))
-        ar = _autoregression(e, ok, len(unit), range(1, ORDER + 1) if order is None else range(order, order + 1))
+        ar = _autoregression(e, ok, order)
         used, w = _whitened(e[:, None], ok, ar, judged)
         numbers, h = noise_model(w[:, 0], len(unit))
         root = np.ones(len(y))
@@ -248,33 +248,18 @@ def _whitened(rows: Array, ok: Array, ar: Array, judged: Array | None = None) ->
     p, usable = len(ar), ok if judged is None else judged
     if not p:
         return np.flatnonzero(usable), rows[usable]
-    complete, white = usable[p:].copy(), rows[p:].copy()
-    for lag, a in enumerate(ar, 1):
-        complete &= ok[p - lag : len(ok) - lag]
-        white -= a * rows[p - lag : len(rows) - lag]
-    return p + np.flatnonzero(complete), white[complete]
+    at = np.flatnonzero(usable[p:])
+    at = p + at[np.all([ok[p - lag :][at] for lag in range(1, p + 1)], axis=0)]
+    return at, rows[at] - sum(a * rows[at - lag] for lag, a in enumerate(ar, 1))
 
 
-def _autoregression(e: Array, ok: Array, n: int, orders: range) -> Array:
-    """Coefficients of the order with the smallest BIC, or of the only one; outliers are limited to three scales.
-
-    Each order is compared with the one below on all samples whose lags are complete, of which there must be `COMPLETE`,
-    and five for each of n parameters.
-    """
-    limit = 3.0 * deviation(e[ok])
-    e = np.clip(e, -limit, limit)
-    found, gain, best = np.zeros(0), 0.0, 0.0
-    for p in orders if orders.start else ():
-        used, _ = _whitened(e[:, None], ok, np.zeros(p))
-        N = len(used)
-        if max(COMPLETE, 5 * n) > N:
-            break
-        R = np.asarray(np.linalg.qr(np.column_stack([*(e[used - lag] for lag in range(1, p + 1)), e[used]]), mode="r"))
-        # the last two rows: what each order leaves
-        gain += N * np.log1p((R[p - 1, p] / max(abs(R[p, p]), SMALLEST)) ** 2) - np.log(N)
-        if gain > best or len(orders) == 1:
-            best, found = gain, np.linalg.lstsq(R[:p, :p], R[:p, -1], rcond=None)[0]
-    return np.asarray(found)
+def _autoregression(e: Array, ok: Array, order: int | None) -> Array:
+    """Coefficients of an order, the one of least BIC if it is None, of residuals that are limited as the verdict's."""
+    limit = HELD * deviation(e[ok])
+    lags = lags_of(e, ORDER, ok, season=0) if order is None else np.arange(1, order + 1)
+    whole = np.zeros(len(e))
+    whole[complete(ok, lags)] = 1.0
+    return regressed(np.clip(e, -limit, limit), whole, lags)
 
 
 def _clip(x: Array) -> float:

@@ -33,11 +33,6 @@ DOUBT = 0.01
 """Level of the test of whether the reference is constant."""
 
 
-def burn(run: Track) -> int:
-    """Number of samples at the beginning of a run that are not judged, because its estimate has just started."""
-    return burn_in(run.model.n)
-
-
 def least(kind: str, n: int) -> int:
     """Normal samples after the start of a run of n parameters that an alarm of a kind needs."""
     return max(100, 10 * n) if kind == "glr" else LEAST
@@ -55,9 +50,10 @@ def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
 
     ``reference`` is a number of first samples, or (from, to) in samples, without the last.
     """
-    if len(run) < burn(run) + LEAST:
+    begun = burn_in(run.model.n)
+    if len(run) < begun + LEAST:
         raise ValueError(
-            f"detect: a run of {len(run)} samples is too short for a reference: its first {burn(run)} samples are its "
+            f"detect: a run of {len(run)} samples is too short for a reference: its first {begun} samples are its "
             f"start, and at least {LEAST} normal ones are needed after them."
         )
     if isinstance(reference, tuple) and len(reference) == 2:
@@ -69,10 +65,10 @@ def normal_samples(run: Track, reference: Any) -> tuple[int, int]:
         )
     else:
         first, end = 0, whole("detect", "reference", reference, 1)
-    used = max(first, burn(run))
+    used = max(first, begun)
     if not used + LEAST <= end <= len(run):
         raise ValueError(
-            f"detect: the reference covers samples {first} to {end} of a run of {len(run)}, whose first {burn(run)} "
+            f"detect: the reference covers samples {first} to {end} of a run of {len(run)}, whose first {begun} "
             f"are its start and do not count: {max(end - used, 0)} remain, and at least {LEAST} are needed."
             if end <= len(run)
             else f"detect: the reference ends at sample {end}, and the run has {len(run)}."
@@ -84,8 +80,9 @@ def first_third(run: Track, usable: Array, least: int) -> tuple[int, int]:
     """(first, end) of the samples that are taken as normal where no reference was given: the first third of the record,
     and up to three quarters if fewer would have less than ``least`` ``usable`` samples.
     """
-    enough = np.flatnonzero(np.cumsum(usable[burn(run) :]) >= least)
-    needed = burn(run) + int(enough[0]) + 1 if enough.size else len(run)
+    begun = burn_in(run.model.n)
+    enough = np.flatnonzero(np.cumsum(usable[begun:]) >= least)
+    needed = begun + int(enough[0]) + 1 if enough.size else len(run)
     return normal_samples(run, max(len(run) // 3, min(needed, 3 * len(run) // 4)))
 
 

@@ -15,7 +15,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.changes.dates import LEVEL, Dated, counted, dated
 from driftfit.judge.changes.fit import NONE, order_of, white_rows
 from driftfit.judge.changes.kinds import UNIT_ROOT, Kind, kind
-from driftfit.judge.changes.null import Lags, Model, Tested, modelled, tested
+from driftfit.judge.changes.null import Model, Tested, tested
 from driftfit.judge.changes.which import Which, which
 
 
@@ -51,24 +51,16 @@ class Changes(NamedTuple):
         return bool(len(self.model.noise.lags) and len(self.model.y) * (1.0 - self.test.root) < UNIT_ROOT)
 
 
-def changes(
-    phi: Array, y: Array, lags: Lags | None = None, root: Array | None = None, level: float = 0.05,
-    order: int | None = None, dates: float = LEVEL, fewest: int | None = None,
-) -> Changes:  # fmt: skip
-    """Judge y (N,) on phi (N, n): at which ``dates`` (the level of their intervals) its coefficients changed.
-
-    ``lags``: which columns are earlier outputs. ``root`` (N,): what rows were multiplied by. ``level``: error rate of
-    the test. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows
-    in a segment.
-    """
-    N, n = phi.shape
-    model = modelled(phi, y, lags, root, order, fewest)
+def changes(model: Model, level: float, dates: float = LEVEL) -> Changes:
+    """Judge a regression: at which dates its coefficients changed, by a test with the error rate ``level``, with
+    intervals of the level ``dates``."""
+    N, n = model.phi.shape
     test, draws = tested(model)
     breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
     if test.p < level:
         breaks, ar, prices = counted(model, test, draws, level)
     found = dated(model, breaks, ar, prices, dates)
-    changed = which(model, found)
+    changed = which(model, found) if len(breaks) else Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
     if (changed.dates != found.breaks).any():
         found = dated(model, changed.dates, ar, prices, dates, final=True)
     moving = tuple(sorted({j for own in changed.at for j in own}))

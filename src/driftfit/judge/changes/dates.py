@@ -19,14 +19,16 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
-from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price, radius
-from driftfit.judge.changes.scan import SINGULAR, SMALL, add
-from driftfit.judge.statistics.robust import cholesky, orthonormal, solved
+from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price
+from driftfit.judge.changes.scan import SINGULAR, add
+from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
+DOUBT = 1.5
+"""Standard errors by which a price is changed to see whether the number depends on more draws."""
 SWEEPS = 4
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
@@ -76,7 +78,7 @@ def _at_each(
                     G[i, j] += row[i] * row[j]
         for i in range(k):
             G[i, i] += least
-        rss[d] = cholesky(G, k, 0.0)
+        rss[d] = eliminate(G, k, 0.0)
         solved(G, theta[d])
 
 
@@ -145,19 +147,25 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     gain = N * np.log(test.rss[0] / test.rss[:room])
     first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
 
-    def number(drawn: Array) -> tuple[int, tuple[float, float]]:
-        prices = price(drawn[:, 0], level / SHARE), price(drawn[:, 1], level / SHARE)
-        return stepwise(gain, prices) or first, prices
+    def number(drawn: Array, constants: tuple[Array, Array], most: int) -> tuple[int, tuple[float, float]]:
+        """The number and its prices, from more draws of constants while it may depend on them."""
+        for count in DRAWS:
+            if most > len(drawn) < count:
+                drawn = np.vstack([drawn, draws.gains(*constants, count - len(drawn))])
+            (one, error), (two, other) = (price(each, level / SHARE) for each in drawn.T)
+            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (DOUBT, -DOUBT))
+            if len(drawn) >= DRAWS[1] and few == many:
+                break
+        return stepwise(gain, (one, two)) or first, (one, two)
 
     dynamic = len(noise.lags) or len(model.lags.columns)
-    rest = 0 if dynamic else DRAWS[-1] - len(test.gains)
-    K, prices = number(np.vstack([test.gains, draws.gains(*draws.constants, rest)]))
+    K, prices = number(test.gains, draws.constants, 0 if dynamic else DRAWS[-1])
     if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = test.breaks[K], test.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
-        if max(radius(ar, noise.lags), draws.of_outputs(mean)) < 1.0:
-            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
+        if draws.root(mean, ar) < 1.0:
+            K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
     return test.breaks[K], test.ar[K], prices
 
 
@@ -185,7 +193,7 @@ def dated(
             theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)
             ar = regressed(noise_of(X, y, theta, breaks), noise.g, noise.lags)
     parts = (noise.lags, ar, noise.g)
-    whole = estimated(X, y, parts, breaks)[1]
+    whole = estimated(X, y, parts, breaks)[1] if K else 0.0
     for k in range(K):
         place, rss, theta = profile(model, ar, breaks, k, max(n + 1, first + 1, 3))
         rss += max(whole - rss[place == breaks[k]][0], 0.0)
@@ -195,15 +203,14 @@ def dated(
         spans[k] = min(inside[0], breaks[k]), max(inside[1], breaks[k])
         theta = theta @ model.basis.T
         moved[k : k + 2] += np.einsum("m,mkj->kj", weight, (theta - np.einsum("m,mkj->kj", weight, theta)) ** 2)
-    edges = [(0, N), *_certain(breaks, spans, N, n)]
-    known = [_directions(model, a, b) for a, b in edges]
-    rows = np.hstack([part @ one for part, one in zip(np.split(split(X, breaks), K + 1, axis=1), known, strict=True)])
+    certain = _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
+    found = [informed(model.phi[first:last]) for first, last in certain] if K else []
+    later = zip(np.split(split(X, breaks), K + 1, axis=1)[1:], found[1:], strict=True)
+    rows = np.hstack([X, *(part @ _projector(model, directions) for part, (_, directions) in later)])
     theta, left = estimated(X, y, parts, breaks, rows)
     std = _errors(model, rows, parts, moved)
-    unknown = [
-        undetermined(model.phi[a:b]) for a, b in _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
-    ]
-    std[np.array(unknown)] = np.inf
+    for k, (unknown, _) in enumerate(found):
+        std[k, unknown] = np.inf
     return Dated(breaks, spans, theta @ model.basis.T, std, moved, ar, left, prices)
 
 
@@ -234,27 +241,24 @@ def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int
     return found
 
 
-def _directions(model: Model, first: int, last: int) -> Array:
-    """The projector (n, n), in the basis, on changes of what rows first .. last determine."""
-    n = model.X.shape[1]
-    basis = orthonormal(model.phi[first:last])
-    size, directions = np.linalg.svd(basis.R)[1:]
-    kept = directions[size > basis.negligible]
-    if len(kept) == n:
-        return np.eye(n)
-    scale = orthonormal(model.phi).size
-    own = kept * (basis.size / scale)
-    Q = np.linalg.qr(np.linalg.solve(model.basis, (np.linalg.qr(own.T)[0]) / scale[:, None]))[0]
-    return np.asarray(Q @ Q.T)
-
-
 COMPONENT = 1e-6
 """Smallest component, in units of the regressors, that a direction has in a parameter."""
 
 
-def undetermined(phi: Array) -> Array:
-    """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in."""
+def informed(phi: Array) -> tuple[Array, Array]:
+    """Which parameters (n,) have a component in a direction that rows phi (N, n) do not vary in, and the directions
+    (r, n) of the coefficients of the combinations that they do vary in."""
     basis = orthonormal(phi)
-    _, size, directions = np.linalg.svd(basis.R)
+    size, directions = np.linalg.svd(basis.R)[1:]
     rank = int(np.sum(size > basis.negligible))
-    return np.asarray(np.linalg.norm(directions[rank:], axis=0) > COMPONENT)
+    return np.linalg.norm(directions[rank:], axis=0) > COMPONENT, directions[:rank] * basis.size
+
+
+def _projector(model: Model, directions: Array) -> Array:
+    """The projector (n, n), in the basis, on changes of what rows of these directions determine."""
+    if len(directions) == model.X.shape[1]:
+        return np.eye(model.X.shape[1])
+    scale = orthonormal(model.phi).size
+    own = np.linalg.qr((directions / scale).T)[0]
+    Q = np.linalg.qr(np.linalg.solve(model.basis, own / scale[:, None]))[0]
+    return np.asarray(Q @ Q.T)

@@ -12,16 +12,16 @@ is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
 
 from __future__ import annotations
 
-from itertools import pairwise
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array
-from driftfit.judge.changes.scan import SINGULAR, SMALL, problem_of, searched
-from driftfit.judge.statistics.robust import deviation, robust_fit
-from driftfit.judge.statistics.whiteness import loudest
+from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.changes.scan import SINGULAR, problem_of, searched
+from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible
+from driftfit.judge.statistics.whiteness import loudest, ranks
 
 NONE = np.zeros(0, np.int64)
 HELD = 3.0
@@ -34,10 +34,10 @@ ORDER = 6
 """Largest order of the autoregression; a season may add one further lag."""
 SEASON = 24
 ROUNDS = 4
+SETTLED = 0.1
+"""Standard deviation of the logarithm of a change of weights after which segments and lags are searched again."""
 KNOTS = (3, 5, 9, 17, 33)
 """Knots of lines that parameters may move on."""
-ROUNDED = 1e-14
-"""Information below this share of that of the whole record is rounding."""
 MOST = 12
 """Largest number of breaks."""
 WINDOWS = 12
@@ -61,6 +61,8 @@ class Noise(NamedTuple):
     """(N, q): the regressors of these."""
     fewest: int
     """Rows in the shortest segment that is searched."""
+    ranks: Array
+    """(N, n): those of the sizes of the regressors."""
 
 
 def shortest(n: int, lags: Array, given: int | None = None) -> int:
@@ -71,6 +73,13 @@ def shortest(n: int, lags: Array, given: int | None = None) -> int:
 def order_of(lags: Array) -> int:
     """The last lag; 0 if there is none."""
     return int(lags[-1]) if len(lags) else 0
+
+
+def complete(ok: Array, lags: Array) -> Array:
+    """Indices of the rows that are ``ok`` (N,), as are all their lags."""
+    at = np.flatnonzero(ok)
+    at = at[at >= order_of(lags)]
+    return np.asarray(at[ok[at[:, None] - lags].all(axis=1)])
 
 
 def white_rows(X: Array, y: Array, lags: Array, ar: Array, g: Array) -> tuple[Array, Array]:
@@ -88,10 +97,9 @@ def split(X: Array, breaks: Array) -> Array:
     return np.hstack([X, *(X * (t >= b) for b in breaks)])
 
 
-def moments(Z: Array, share: Array | float = ROUNDED) -> Array:
-    """Z' Z of columns Z (N, q), with this share of their mean beside their own, so that it can be inverted."""
-    G = Z.T @ Z
-    return np.asarray(G + np.diag(np.trace(G) / len(G) * share + np.full(len(G), SMALL)))
+def coefficients(Z: Array, z: Array, share: Array | float = ROUNDED) -> Array:
+    """Least squares (q,) of z (N,) on columns Z (N, q)."""
+    return np.linalg.solve(invertible(Z.T @ Z, share), Z.T @ z)
 
 
 def estimated(
@@ -104,14 +112,14 @@ def estimated(
     Z, z = white_rows(split(X, breaks) if rows is None else rows, y, *noise)
     n, K = X.shape[1], len(breaks)
     ridge = np.append(np.full(n, ROUNDED), np.full(K * n, SINGULAR))
-    beta = np.linalg.solve(moments(Z, ridge), Z.T @ z)
+    beta = coefficients(Z, z, ridge)
     r = z - Z @ beta
     return np.cumsum(beta.reshape(K + 1, n), axis=0), float(r @ r)
 
 
 def left(Z: Array, z: Array, floor: float = SMALL) -> float:
     """Sum of squares of z (N,) that columns Z (N, q) do not explain, beyond rounding."""
-    r = z - Z @ np.linalg.lstsq(Z, z, rcond=None)[0]
+    r = z - Z @ coefficients(Z, z)
     return max(float(r @ r), floor)
 
 
@@ -124,34 +132,76 @@ def noise_of(X: Array, y: Array, theta: Array, breaks: Array) -> Array:
 def regressed(v: Array, g: Array, lags: Array) -> Array:
     """Autoregression (p,) of v (N,)."""
     first = order_of(lags)
-    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else np.zeros((len(v), 0))
+    past = np.column_stack([v[first - lag : len(v) - lag] for lag in lags]) if len(lags) else NONE
     w = g[first:]
-    return np.asarray(np.linalg.lstsq(past * w[:, None], v[first:] * w, rcond=None)[0])
+    return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
-def lags_of(v: Array, most: int) -> Array:
-    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear."""
+def _multiply(v: Array, G: Array) -> None:
+    """G (k, k), a lower triangle: sums of products of v (N,) with the lags 1 .. k - 1, and last of v itself, from row
+    k - 1 on; those of two lags follow from those of one less each."""
+    last, N = G.shape[0] - 1, v.shape[0]
+    for i in range(last + 1):
+        for t in range(last, N):
+            G[last, i - 1 if i > 0 else last] += v[t] * v[t - i]
+        for j in range(1, last + 1 - i):
+            before = G[i + j - 2, j - 2] if j > 1 else G[last, i - 1 if i > 0 else last]
+            G[i + j - 1, j - 1] = before + v[last - i - j] * v[last - j] - v[N - i - j] * v[N - j]
+
+
+_multiplied = Driver(_multiply)
+
+
+def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
+    """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
+    last = G.shape[0] - 1
+    for i in range(last + 1):
+        G[i, i] += SINGULAR * G[i, i] + SMALL
+    eliminate(G, most, 0.0)
+    price = np.log(count + last)
+    least = SINGULAR * G[last, last]
+    left = best = G[last, last]
+    for p in range(1, most + 1):
+        left -= G[last, p - 1] * G[last, p - 1] * G[p - 1, p - 1]
+        if np.log(max(left, least) / best) * count + price * (p - chosen[0]) < 0.0:
+            best, chosen[0] = max(left, least), p
+    share = 0.0
+    for s in range(most, last):
+        rest, tie = G[s, s], G[last, s]
+        for j in range(chosen[0]):
+            rest -= G[s, j] * G[s, j] * G[j, j]
+            tie -= G[s, j] * G[last, j] * G[j, j]
+        if tie * tie > share * best * max(rest, SMALL):
+            share, chosen[1] = min(tie * tie / (best * max(rest, SMALL)), 1.0 - SINGULAR), s + 1
+    if share > 0.0 and -count * np.log1p(-share) < price + 2.0 * np.log(last - most):
+        chosen[1] = 0
+
+
+_chosen = Driver(_choose)
+
+
+def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
+    """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
+    Only rows are used that are ``ok`` (N,), as are all their lags."""
     N = len(v)
-    limit = HELD * deviation(v)
-    v = np.clip(v, -limit, limit) if limit > 0.0 else v
-    longest = max(most, min(SEASON, N // 12))
-    if most < 1 or longest >= N // 3:
+    limit = HELD * deviation(v if ok is None else v[ok])
+    if most < 1:
         return NONE
-    rows = np.column_stack([v[longest - lag : N - lag] for lag in range(longest + 1)])
-    G = rows.T @ rows
-    G += np.diag(SINGULAR * np.diag(G) + SMALL)
-    count, price = N - longest, np.log(N)
-    own = np.linalg.solve(np.linalg.cholesky(G[1 : most + 1, 1 : most + 1]), G[1 : most + 1, 0])
-    left = np.maximum(G[0, 0] - np.append(0.0, np.cumsum(own**2)), SINGULAR * G[0, 0])
-    p = int(np.argmin(count * np.log(left) + price * np.arange(most + 1)))
-    lags, seasons = np.arange(1, p + 1), np.append(0, np.arange(most + 1, longest + 1))
-    if len(seasons) > 1:
-        ties = G[np.ix_(lags, seasons)]
-        rest = G[np.ix_(seasons, seasons)] - ties.T @ np.linalg.solve(G[np.ix_(lags, lags)], ties)
-        gain = rest[0, 1:] ** 2 / np.maximum(np.diag(rest)[1:], SMALL)
-        if -count * np.log1p(-min(gain.max() / left[p], 1.0 - SINGULAR)) > price + 2.0 * np.log(len(gain)):
-            lags = np.append(lags, seasons[1 + int(np.argmax(gain))])
-    return lags
+    longest, found = max(most, min(season, N // 12)), np.zeros(2, np.int64)
+    v = np.clip(v, -limit, limit) if limit > 0.0 else v
+    if ok is None:
+        count, G = N - longest, np.zeros((longest + 1, longest + 1))
+        if count > 2 * longest:
+            _multiplied(v, G)
+    else:
+        at = complete(ok, np.arange(1, longest + 1))
+        rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
+        count, G = len(at), rows.T @ rows
+    if count <= 2 * longest:
+        return NONE
+    _chosen(G, count, most, found)
+    lags = np.arange(1, found[0] + 1)
+    return np.append(lags, found[1]) if found[1] else lags
 
 
 def level_of(e: Array, first: int) -> Array:
@@ -160,43 +210,51 @@ def level_of(e: Array, first: int) -> Array:
     s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
     m = max(3, min(WINDOWS, N // 20))
     edges = np.linspace(first, N, m + 1).astype(int)
-    parts = [np.sort(np.abs(e[a:b])) for a, b in pairwise(edges)]
-    middles = (0.5 * (part[(len(part) - 1) // 2] + part[len(part) // 2]) for part in parts)  # as `np.median`, faster
-    held = (np.minimum(part, HELD * max(MEDIAN * float(x), 0.05 * s)) for part, x in zip(parts, middles, strict=True))
-    own = np.log([max(np.sqrt(np.mean(part**2)), 0.05 * s) for part in held])
+    count = np.diff(edges)
+    parts = np.full((m, count.max()), np.inf)
+    parts[np.arange(count.max()) < count[:, None]] = np.abs(used)
+    parts.sort(axis=1)
+    middle = 0.5 * (parts[np.arange(m), (count - 1) // 2] + parts[np.arange(m), count // 2])
+    limit = HELD * np.maximum(MEDIAN * middle, 0.05 * s)[:, None]
+    square = np.sum(np.where(np.isfinite(parts), np.minimum(parts, limit), 0.0) ** 2, axis=1) / count
+    own = np.log(np.maximum(np.sqrt(square), 0.05 * s))
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
     middle = float(np.median(own))
     return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 
+@lru_cache(2 * len(KNOTS))
 def hats(N: int, knots: int) -> Array:
     """(N, knots): piecewise linear functions, each 1 at its own knot."""
     at = np.linspace(0.0, N - 1.0, knots)
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
-def lined(X: Array, knots: int) -> Array:
-    """(N, n knots): regressors X (N, n) of parameters on continuous lines between evenly spaced knots."""
-    return np.asarray((hats(len(X), knots)[:, :, None] * X[:, None, :]).reshape(len(X), -1))
+def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
+    """Sums of products G (knots n + 1, ..) of z (M,) and of Z (M, n) times hats (M, knots): of two of these at most."""
+    n, last, k = Z.shape[1], G.shape[0] - 1, 0
+    for t in range(Z.shape[0]):
+        while k + 2 < hat.shape[1] and not hat[t, k] > 0.0:
+            k += 1
+        for j in range(n):
+            row[j], row[n + j] = Z[t, j] * hat[t, k], Z[t, j] * hat[t, k + 1]
+        for i in range(2 * n):
+            for j in range(2 * n):
+                G[k * n + i, k * n + j] += row[i] * row[j]
+            G[last, k * n + i] += row[i] * z[t]
+
+
+_accumulated = Driver(_accumulate)
 
 
 def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
-    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N.
-
-    Only two hats are not 0 between two knots, so the sums of products there are those of 2 n columns.
-    """
-    n, first, hat = Z.shape[1], N - len(z), hats(N, knots)
-    ends = np.append(0, np.ceil(np.linspace(0.0, N - 1.0, knots)[1:-1]))
-    rows = [slice(max(int(a) - first, 0), max(int(b) - first, 0)) for a, b in pairwise([*ends, N])]
-    G, own = np.zeros((knots * n + 1, knots * n + 1)), np.append(np.arange(2 * n), knots * n)
-    for k, s in enumerate(rows):
-        A = np.hstack([Z[s] * hat[first:][s, k : k + 1], Z[s] * hat[first:][s, k + 1 : k + 2], z[s, None]])
-        G[own[:, None], own] += A.T @ A
-        own[:-1] += n
-    G[np.diag_indices(knots * n)] += ROUNDED * np.trace(G[:-1, :-1]) / (knots * n) + SMALL
-    path = hat @ np.linalg.solve(G[:-1, :-1], G[:-1, -1]).reshape(knots, n)
-    return path, z - np.einsum("tj,tj->t", Z, path[first:])
+    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N."""
+    n, hat = Z.shape[1], hats(N, knots)
+    own, G = hat[N - len(z) :], np.zeros((knots * n + 1, knots * n + 1))
+    _accumulated(Z, z, own, np.empty(2 * n), G)
+    path = hat @ np.linalg.solve(invertible(G[:-1, :-1]), G[-1, :-1]).reshape(knots, n)
+    return path, z - np.einsum("tj,tj->t", Z, path[N - len(z) :])
 
 
 def divided(
@@ -212,14 +270,16 @@ def divided(
 
 
 def together(
-    X: Array, y: Array, g: Array, orders: int, most: int, given: int | None = None
+    X: Array, y: Array, g: Array, order: int | None, most: int, given: int | None = None
 ) -> tuple[Array, Array, Array]:
-    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots."""
+    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots; segments with the lags of
+    an ``order`` if that is given."""
     N, n = X.shape
     theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
     best: tuple[float, Array, Array, Array] | None = None  # criterion, lags, ar, rows
     tried: list[list[int]] = []
-    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE):
+    orders = min(ORDER, N // 20)
+    for lags in (lags_of((y - X @ theta[0]) * g, orders), NONE) if order is None else (np.arange(1, order + 1),):
         for _ in range(ROUNDS):
             if lags.tolist() in tried:
                 break
@@ -229,10 +289,10 @@ def together(
             if best is None or criterion < best[0]:
                 best = criterion, lags, ar, split(X, breaks)
             theta, _ = estimated(X, y, (lags, ar, g), breaks)
-            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders)
+            lags = lags_of(noise_of(X, y, theta, breaks) * g, orders) if order is None else lags
     assert best is not None
     for knots in KNOTS:
-        if n * knots > N // 8:
+        if n * knots > N // 8 or order is not None:
             break
         path, r = on_lines(X * g[:, None], y * g, N, knots)
         v = y - np.einsum("tj,tj->t", X, path)
@@ -242,7 +302,7 @@ def together(
             _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
         criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
         if criterion < best[0]:
-            best = criterion, lags, ar, lined(X, knots)
+            best = criterion, lags, ar, np.asarray((hats(N, knots)[:, :, None] * X[:, None, :]).reshape(N, -1))
     return best[1:]
 
 
@@ -251,12 +311,13 @@ def weights(e: Array, level: Array) -> Array:
     return np.asarray(HELD / np.maximum(np.abs(e) / level, HELD) / level)
 
 
-def spread(e: Array, phi: Array) -> Array:
-    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n) with which residuals e (N,) grow, if they clearly do.
+def spread(e: Array, phi: Array, ranked: Array) -> Array:
+    """(N,): sqrt(a + b x^2) of the regressor x of phi (N, n), whose `ranks` are known, with which residuals e (N,)
+    grow, if they clearly do.
 
     The likelihood of Gaussian noise, by weighted least squares of squares that are limited at three deviations.
     """
-    most = loudest(e, phi)
+    most = loudest(e, ranked)
     if most is None:
         return np.ones(len(e))
     A = np.column_stack([np.ones(len(e)), phi[:, most] ** 2 / np.mean(phi[:, most] ** 2)])
@@ -268,27 +329,22 @@ def spread(e: Array, phi: Array) -> Array:
     return np.asarray(np.sqrt(size / np.median(size)))
 
 
-def noise(X: Array, y: Array, phi: Array, order: int | None = None, fewest: int | None = None) -> Noise:
-    """The noise of y (N,) on X (N, n), X' X = N I, which are phi in a basis; of some ``order`` if that is given."""
+def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = None, fewest: int | None = None) -> Noise:
+    """The noise of y (N,) on X (N, n), phi in a basis, whose constants are known; of some ``order`` if it is given."""
     N, n = X.shape
     most = max(0, min(MOST, N // shortest(n, NONE, fewest) - 1))
-    lags = NONE if order is None else np.arange(1, order + 1)
-    constants = robust_fit(X, y)
-    e = constants.residual
+    e, ranked = constants.residual, ranks(phi)
     level = np.full(N, max(constants.scale, FLOOR * float(np.std(e)), SMALL))
-    level *= spread(e / level, phi)
+    level *= spread(e / level, phi, ranked)
     g = weights(e, level)
-    for _ in range(2):
-        if order is None:
-            lags, ar, rows = together(X, y, g, min(ORDER, N // 20), most, fewest)
-        else:
-            breaks, ar, _ = divided(X, y, lags, g, most, fewest)
-            rows = split(X, breaks)
-        Z, z = white_rows(rows, y, lags, ar, g)
+    lags, ar, rows = together(X, y, g, order, most, fewest)
+    for last in (False, True):
         first = order_of(lags)
-        v = y - rows @ np.linalg.solve(moments(Z), Z.T @ z)
+        v = y - rows @ coefficients(*white_rows(rows, y, lags, ar, g))
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
-        size = spread(e, phi)
+        size = spread(e, phi, ranked)
         level = size * level_of(e / size, first)
-        g = weights(e, level)
-    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest))
+        before, g = g, weights(e, level)
+        if not last and np.std(np.log(g / before)) > SETTLED:
+            lags, ar, rows = together(X, y, g, order, most, fewest)
+    return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest), ranked)

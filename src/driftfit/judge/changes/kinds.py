@@ -19,21 +19,23 @@ paths.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import hats, left, order_of, split, white_rows
+from driftfit.judge.changes.fit import coefficients, hats, left, order_of, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SINGULAR, SMALL
+from driftfit.judge.changes.scan import SINGULAR
 from driftfit.judge.changes.which import Which
+from driftfit.judge.statistics.robust import SMALL, invertible
 
 KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
 CORNERS = 24
 """Cells at whose ends a gradual change may begin or end."""
-STEPS = tuple(10.0**k for k in np.arange(-7.0, 0.5, 0.5))
+STEPS = 10.0 ** np.arange(-7.0, 0.5, 0.5)
 """Variances of a step of the walk, as shares of the noise."""
 UNIT_ROOT = 14.1
 """N (1 - root) below which a unit root is not rejected at 5 % (Dickey and Fuller, 1979, with a constant)."""
@@ -56,41 +58,61 @@ class Kind(NamedTuple):
     """Of a drift with jumps, the dates that it needs."""
 
 
-def _filter(H: Array, q: Array, W: Array, state: Array, P: Array, gain: Array, total: Array) -> None:
-    """Innovations, in place and over their deviation, of columns W (N, c) as outputs of a walk on H (N, J) with steps
-    of variance q (J,), known at the start, in noise of variance 1; the sum of log f to total (1,)."""
+def _filter(H: Array, steps: Array, columns: Array, scratch: tuple[Array, ...], products: Array, totals: Array) -> None:
+    """Of a walk on H (N, J), known at the start, in noise of variance 1, for steps of each variance (S,): sums of
+    products (S, c, c) of the innovations of columns (N, c) over their deviation, and the sum of log f to totals."""
+    state, P, gain, row = scratch
     N, J = H.shape
-    for t in range(N):
-        f = 1.0
+    for s in range(steps.shape[0]):
         for i in range(J):
-            P[i, i] += q[i]
-        for i in range(J):
-            gain[i] = 0.0
+            for c in range(state.shape[1]):
+                state[i, c] = 0.0
             for j in range(J):
-                gain[i] += P[i, j] * H[t, j]
-            f += H[t, i] * gain[i]
-        for i in range(J):
-            for j in range(J):
-                P[i, j] -= gain[i] * gain[j] / f
-        root = np.sqrt(f)
-        total[0] += np.log(f)
-        for c in range(W.shape[1]):
-            e = W[t, c]
+                P[i, j] = 0.0
+        for t in range(N):
+            f = 1.0
             for i in range(J):
-                e -= H[t, i] * state[i, c]
+                P[i, i] += steps[s]
             for i in range(J):
-                state[i, c] += gain[i] * e / f
-            W[t, c] = e / root
+                gain[i] = 0.0
+                for j in range(J):
+                    gain[i] += P[i, j] * H[t, j]
+                f += H[t, i] * gain[i]
+            for i in range(J):
+                for j in range(J):
+                    P[i, j] -= gain[i] * gain[j] / f
+            totals[s] += np.log(f)
+            for c in range(state.shape[1]):
+                row[c] = columns[t, c]
+                for i in range(J):
+                    row[c] -= H[t, i] * state[i, c]
+                for i in range(J):
+                    state[i, c] += gain[i] * row[c] / f
+                for d in range(c + 1):
+                    products[s, c, d] += row[c] * row[d] / f
+        for c in range(state.shape[1]):
+            for d in range(c):
+                products[s, d, c] = products[s, c, d]
 
 
 _filtered = Driver(_filter)
 
 
-def innovations(H: Array, q: Array, W: Array) -> tuple[Array, float]:
-    """Innovations of columns W (N, c) over their deviation, and the sum of log f."""
-    J, W, total = H.shape[1], W.copy(), np.zeros(1)
-    _filtered(np.ascontiguousarray(H), q, W, np.zeros((J, W.shape[1])), np.zeros((J, J)), np.zeros(J), total)
-    return W, float(total[0])
+def innovations(H: Array, steps: Array, columns: Array) -> tuple[Array, Array]:
+    """Sums of products (S, c, c) of the innovations of columns (N, c), and the sums (S,) of log f, by steps (S,)."""
+    J, c, S = H.shape[1], columns.shape[1], len(steps)
+    products, totals = np.zeros((S, c, c)), np.zeros(S)
+    scratch = np.zeros((J, c)), np.zeros((J, J)), np.zeros(J), np.zeros(c)
+    _filtered(np.ascontiguousarray(H), steps, columns, scratch, products, totals)
+    return products, totals
+
+
+def unexplained(products: Array, columns: Sequence[int], floor: float) -> Array:
+    """Sums of squares (..) that some columns leave of the last one, by sums of products (.., c, c) of all."""
+    own = np.array(columns)
+    b = products[..., own, -1]
+    solution = np.linalg.solve(invertible(products[..., own[:, None], own]), b[..., None])[..., 0]
+    return np.asarray(np.maximum(products[..., -1, -1] - np.sum(b * solution, axis=-1), floor))
 
 
 def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) -> Kind:
@@ -112,7 +134,7 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     for shape, own, more in shapes:
         columns = np.hstack([phi[:, j : j + 1] * shape for j in moves])
         both = np.hstack([Z, white_rows(columns, model.y, lags, found.ar, g)[0]])
-        beta = np.linalg.lstsq(both, z, rcond=None)[0]
+        beta = coefficients(both, z)
         rss = max(float(np.sum((z - both @ beta) ** 2)), model.floor)
         score = M * np.log(rss) + (len(beta) + more) * price
         if score < scores.get("gradual", np.inf):
@@ -134,22 +156,21 @@ def _rise(N: int, ends: tuple[int, int]) -> Array:
 
 
 def _ramp(Z: Array, z: Array, columns: Array, model: Model, found: Dated) -> tuple[int, int]:
-    """The ends of the best single gradual change of columns (N, J)."""
+    """The ends of the best single gradual change of columns (N, J): a rise is the difference of two hinges."""
     N, J = columns.shape
     Q = np.linalg.qr(Z)[0]
-    r = z - Q @ (Q.T @ z)
     places = np.unique(np.linspace(0, N - 1, min(CORNERS, N // 8) + 1).astype(int))
-    best = (-np.inf, (0, N - 1))
-    for i, start in enumerate(places[:-1]):
-        ends = [(int(start), int(stop)) for stop in places[i + 1 :]]
-        made = np.hstack([columns * _rise(N, one)[:, None] for one in ends])
-        white = white_rows(made, model.y, model.noise.lags, found.ar, model.noise.g)[0]
-        rest = (white - Q @ (Q.T @ white)).reshape(len(z), -1, J).transpose(1, 2, 0)
-        A, b = rest @ rest.transpose(0, 2, 1), rest @ r
-        least = SINGULAR * np.sum(white**2, axis=0).reshape(-1, J).max(axis=1) + SMALL
-        gain = np.sum(np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0] * b, axis=1)
-        best = max(best, (float(gain.max()), ends[int(np.argmax(gain))]))
-    return best[1]
+    hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * columns[:, None, :]
+    white = white_rows(hinges.reshape(N, -1), model.y, model.noise.lags, found.ar, model.noise.g)[0]
+    white -= Q @ (Q.T @ white)
+    products, b = (white.T @ white).reshape(len(places), J, len(places), J), (z @ white).reshape(-1, J)
+    i, j = np.triu_indices(len(places), 1)
+    A = products[i, :, i] - products[i, :, j] - products[j, :, i] + products[j, :, j]
+    b, long = b[i] - b[j], places[j] - places[i]
+    least = SINGULAR * np.sum(Z**2, axis=0).max() * long**2 + SMALL
+    solution = np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0]
+    best = int(np.argmax(np.sum(b * solution, axis=1)))
+    return int(places[i[best]]), int(places[j[best]])
 
 
 def _walks(
@@ -166,21 +187,16 @@ def _walks(
     for ar in (found.ar, np.zeros(len(lags)))[: 2 if first else 1]:
         Z, z = white_rows(columns, model.y, lags, ar, g)
         unit = np.mean(Z[:, moves] ** 2, axis=0)
-        used = int(np.count_nonzero(ar))
-        for step in STEPS:
-            W, total = innovations(Z[:, moves] / np.sqrt(unit), np.full(len(moves), step), np.column_stack([Z, z]))
-            score = len(z) * np.log(left(W[:, :n], W[:, -1], model.floor)) + total + (n + 1 - len(lags) + used) * price
-            walk = min(walk, score)
-            kept = list(range(K))
-            while kept:
-                some = [i for i, (k, _) in enumerate(steps) if k in kept]
-                score = (len(z) * np.log(left(W[:, [*range(n), *(n + i for i in some)]], W[:, -1], model.floor)) + total
-                         + (n + 1 + len(some) + DATE * len(kept) - len(lags) + used) * price)  # fmt: skip
-                if score < both:
-                    both, dates = score, tuple(kept)
-                without = []
-                for k in kept:
-                    rest = [n + i for i, (date, _) in enumerate(steps) if date in kept and date != k]
-                    without.append(left(W[:, [*range(n), *rest]], W[:, -1], model.floor))
-                kept.remove(kept[int(np.argmin(without))])
-    return float(walk), float(both), dates
+        products, totals = innovations(Z[:, moves] / np.sqrt(unit), STEPS, np.column_stack([Z, z]))
+        totals += (n + 1 - len(lags) + int(np.count_nonzero(ar))) * price
+        walk = min(walk, float(np.min(len(z) * np.log(unexplained(products, range(n), model.floor)) + totals)))
+        kept = list(range(K))
+        while kept:
+            some = {k: [n + i for i, (date, _) in enumerate(steps) if date in kept and date != k] for k in [*kept, K]}
+            score = len(z) * np.log(unexplained(products, [*range(n), *some[K]], model.floor)) + totals
+            score += (len(some[K]) + DATE * len(kept)) * price
+            best = int(np.argmin(score))
+            if score[best] < both:
+                both, dates = float(score[best]), tuple(kept)
+            kept.remove(min(kept, key=lambda k: unexplained(products[best], [*range(n), *some[k]], model.floor)))
+    return walk, both, dates

@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, moments, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, MOST, Noise, coefficients, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Recursion, Results, draw
-from driftfit.judge.changes.scan import SMALL, Found, Problem, Work, problem_of, searched
-from driftfit.judge.statistics.robust import orthonormal
+from driftfit.judge.changes.scan import Found, Problem, Work, problem_of, searched
+from driftfit.judge.statistics.robust import SMALL, Basis, Fit, invertible
 
 DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
@@ -56,8 +56,8 @@ class Lags(NamedTuple):
     @property
     def delays(self) -> Array:
         """(k,): by how many rows each is earlier."""
-        known = [np.flatnonzero(one >= 0)[-1] for one in self.source.T]
-        return np.array([row - source[row] for row, source in zip(known, self.source.T, strict=True)], np.int64)
+        last = [np.flatnonzero(source >= 0)[-1] for source in self.source.T]
+        return np.array(last, np.int64) - self.source[last, np.arange(len(last))]
 
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
@@ -90,7 +90,7 @@ class Tested(NamedTuple):
     theta: Array
     """(n,): constants, in units of the model."""
     root: float
-    """Largest root of the dynamics: of the lags of the output, and of the noise."""
+    """`Draws.root`"""
 
 
 class Model(NamedTuple):
@@ -113,21 +113,26 @@ class Model(NamedTuple):
 
 
 def modelled(
-    phi: Array, y: Array, lags: Lags | None, root: Array | None, order: int | None = None, fewest: int | None = None
-) -> Model:
-    """The regression with its noise; no ``lags`` are none, and no ``root`` is 1."""
+    phi: Array, basis: Basis, y: Array, constants: Fit, lags: Lags | None = None, root: Array | None = None,
+    order: int | None = None, fewest: int | None = None,
+) -> Model:  # fmt: skip
+    """The regression of y (N,) on phi (N, n), of which basis and constants are known, with its noise.
+
+    ``lags``: which columns are earlier outputs; None if none is. ``root`` (N,): what rows were multiplied by; None for
+    1. ``order``: that of the autoregression of the noise; None estimates it. ``fewest``: rows in a segment.
+    """
     N = len(y)
     lags = Lags(np.zeros(0, np.int64), np.zeros((N, 0), np.int64), np.zeros((N, 0))) if lags is None else lags
     root = np.ones(N) if root is None else root
-    X, R, size = orthonormal(phi)
-    basis = np.linalg.inv(R) / size[:, None]
-    offset = basis @ np.linalg.lstsq(X, y, rcond=None)[0]
+    X, R, size = basis
+    inverse = np.linalg.inv(R) / size[:, None]
+    offset = inverse @ (X.T @ y / N)
     rounding = ROUNDING * np.abs(y)
-    phi, y, basis = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, basis))
-    found = noise(X, y, phi, order, fewest)
-    r = (y - X @ np.linalg.lstsq(X * found.g[:, None], y * found.g, rcond=None)[0]) * found.g
+    phi, y, inverse = (np.ascontiguousarray(one) for one in (phi, y - phi @ offset, inverse))
+    found = noise(X, y, phi, constants, order, fewest)
+    r = (y - X @ coefficients(X * found.g[:, None], y * found.g)) * found.g
     floor = float(np.sum((rounding * found.g) ** 2) + LOST * (r @ r)) + SMALL
-    return Model(phi, y, offset, X, basis, lags, root, found, floor)
+    return Model(phi, y, offset, X, inverse, lags, root, found, floor)
 
 
 def radius(a: Array, lags: Array) -> float:
@@ -135,6 +140,8 @@ def radius(a: Array, lags: Array) -> float:
     p = order_of(lags)
     if not p:
         return 0.0
+    if p == 1:
+        return float(abs(a[0]))
     companion = np.eye(p, k=-1)
     companion[0, lags - 1] = a
     return float(np.abs(np.linalg.eigvals(companion)).max())
@@ -174,30 +181,26 @@ class Draws:
 
     def unbiased(self, theta: Array, ar: Array) -> tuple[Array, Array]:
         """Constants and their autoregression without the bias of the dynamics, as far as they remain stable."""
-        columns, lags = self.model.lags.columns, self.problem.lags
-        if not len(columns) and not len(lags):
+        if not len(self.model.lags.columns) and not len(ar):
             return theta, ar
         drawn = self.of(theta, ar, BIASED, False)
-        shift = np.median(drawn.theta @ self.model.basis.T, axis=0)
-        turn = np.median(drawn.ar, axis=0) - ar
+        half = slice((BIASED - 1) // 2, BIASED // 2 + 1)  # the median
+        shift = np.sort(drawn.theta @ self.model.basis.T, axis=0)[half].mean(axis=0)
+        turn = np.sort(drawn.ar, axis=0)[half].mean(axis=0) - ar
         if not (np.isfinite(shift).all() and np.isfinite(turn).all()):
             return theta, ar
         for share in np.linspace(1.0, 0.0, 21):
             moved, less = theta - share * shift, ar - share * turn
-            if max(self.of_outputs(moved), radius(less, lags)) <= UNIT:
+            if self.root(moved, less) <= UNIT:
                 return moved, less
         return theta, ar
 
-    def of_outputs(self, theta: Array) -> float:
-        """Largest root of the lags of the output."""
+    def root(self, theta: Array, ar: Array) -> float:
+        """Largest root of the dynamics: of the lags of the output, and of the noise."""
         back = self.model.lags
-        if not len(back.columns):
-            return 0.0
         lags = back.delays
-        order, last = np.argsort(lags), [np.flatnonzero(one >= 0)[-1] for one in back.source.T]
-        ratio = back.ratio[last, np.arange(len(last))]
-        theta = theta + self.model.offset
-        return radius((theta[back.columns] * ratio)[order], lags[order])
+        own = (theta + self.model.offset)[back.columns][np.argsort(lags)]
+        return max(radius(own, np.sort(lags)), radius(ar, self.problem.lags))
 
 
 def p_of(x: float, drawn: Array) -> float:
@@ -211,11 +214,12 @@ def p_of(x: float, drawn: Array) -> float:
     return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
 
 
-def price(drawn: Array, level: float) -> float:
-    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
+def price(drawn: Array, level: float) -> tuple[float, float]:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R, and its standard error."""
     R = len(drawn)
     top = np.sort(drawn)[-max(10, R // 10) :]
-    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
+    mean, reach = float(np.mean(top[1:] - top[0])), np.log(len(top) / (R + 1) / level)
+    return float(top[0] + mean * reach), float(mean * np.sqrt((1.0 + reach**2) / len(top)))
 
 
 def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
@@ -245,7 +249,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
     Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
-    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(moments(Z), Z.T), axis=0), 0.1)
+    held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(invertible(Z.T @ Z), Z.T), axis=0), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
     draws = Draws(model, few, held)
@@ -257,13 +261,12 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
         R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
-        if p * len(R) > CLEAR or (p < SURE and count >= DRAWS[1]):
+        if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
     p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
-    root = max(draws.of_outputs(theta), radius(ar, noise.lags))
     dates = tuple(found.at[k, :k] for k in range(most + 1))
     constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, root), draws
+    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, draws.root(theta, ar)), draws
 
 
 def gains(rss: Array, N: int) -> Array:

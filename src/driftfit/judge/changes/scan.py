@@ -21,12 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, shared
-from driftfit.judge.statistics.robust import cholesky, solved
+from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
 """Information below this share of that of the whole record is none."""
-SMALL = 1e-300
-"""Added to a diagonal, so that it can be inverted."""
 CELLS = 32
 """Cells at whose ends breaks are compared."""
 FINER = 8
@@ -154,7 +152,7 @@ def autoregression(v: Array, g: Array, lags: Array, H: Array, a: Array) -> None:
                 H[i, j] += left * (v[t] if j == p else v[t - lags[j]])
     for i in range(p):
         H[i, i] += SINGULAR * H[i, i] + SMALL
-    cholesky(H, p, 0.0)
+    eliminate(H, p, 0.0)
     solved(H, a)
 
 
@@ -205,7 +203,7 @@ def cost(first: Array, last: Array, G: Array, least: float) -> float:
     for i in range(G.shape[0]):
         for j in range(i + 1):
             G[i, j] = last[i, j] - first[i, j]
-    return cholesky(G, G.shape[0] - 1, least)  # type: ignore[no-any-return]
+    return eliminate(G, G.shape[0] - 1, least)  # type: ignore[no-any-return]
 
 
 @shared
@@ -216,7 +214,7 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
         whiten(X, y, problem.g, problem.lags, a, work.Z)
         copy(work.C[0], work.G)
         add(work.Z, 0, N, work.G)
-        rss = cholesky(work.G, X.shape[1], 0.0)
+        rss = eliminate(work.G, X.shape[1], 0.0)
         solved(work.G, work.theta)
         if a.shape[0] == 0:
             break
@@ -351,15 +349,14 @@ def nyblom(problem: Problem, work: Work, L: Array) -> None:
         L[k] = form(problem.paths[k - 1], M) / (N * max(form(problem.paths[k - 1], V), SMALL))
     for i in range(n):
         V[i, i] += SINGULAR * V[i, i] + SMALL
-    cholesky(V, n, 0.0)
-    # the trace of V^-1 M = F'^-1 F^-1 M, column by column of M
+    eliminate(V, n, 0.0)
+    # the trace of V^-1 M, column by column of M
     L[0] = 0.0
     for j in range(n):
         for i in range(n):
             V[n, i] = M[i, j] if i >= j else M[j, i]
             for k in range(i):
-                V[n, i] -= V[i, k] * V[n, k]
-            V[n, i] = V[n, i] / V[i, i] if V[i, i] > 0.0 else 0.0
+                V[n, i] -= V[i, k] * V[n, k] * V[k, k]
         solved(V, score)
         L[0] += score[j] / N
 

@@ -19,7 +19,7 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.changes.dates import Dated, covariance
 from driftfit.judge.changes.fit import left, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SMALL
+from driftfit.judge.statistics.robust import SMALL
 
 ALIKE = 6.0
 """Twice the logarithm of the likelihood ratio from which on the evidence is strong (Kass and Raftery, 1995)."""

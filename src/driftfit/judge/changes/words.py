@@ -62,13 +62,11 @@ class Event(NamedTuple):
 def events(changes: Changes, names: Sequence[str], at: Array, text: Callable[[int], str]) -> tuple[Event, ...]:
     """The events of a record whose rows are the samples ``at`` (N,), whose times ``text`` prints."""
     kind = changes.kind.name
-    if kind == "gradual":
-        found = [_gradual(changes, names, at)]
-    elif kind == "wandering":
-        found = [_wandering(changes, names, at)]
+    if kind in ("gradual", "wandering"):
+        found = [_slow(changes, names, at)]
     elif kind == "drift with jumps":
         steps = _steps(changes, names, at, "jump")
-        found = [_wandering(changes, names, at), *(steps[k] for k in changes.kind.dates)]
+        found = [_slow(changes, names, at), *(steps[k] for k in changes.kind.dates)]
     else:
         found = _joined(_steps(changes, names, at, "step"), changes.which.temporary)
     return tuple(
@@ -115,25 +113,18 @@ def _joined(found: list[Event], temporary: tuple[int, ...]) -> list[Event]:
     return joined
 
 
-def _gradual(changes: Changes, names: Sequence[str], at: Array) -> Event:
-    first, last = changes.kind.ends
-    path, nan = changes.kind.path, float("nan")
-    moves = tuple(Move(names[j], float(path[first, j]), float(path[last, j]), nan) for j in changes.moving)
-    return Event("gradual", int(at[first]), int(at[first]), int(at[first]), int(at[last]), None, None, moves)
+def _slow(changes: Changes, names: Sequence[str], at: Array) -> Event:
+    """An event that takes time: a gradual change, with the values at its ends, or a walk, with its range."""
+    gradual, theta = changes.kind.name == "gradual", changes.found.theta
+    first, last = changes.kind.ends if gradual else (0, len(at) - 1)
+    ends = changes.kind.path[[first, last]] if gradual else (theta.min(axis=0), theta.max(axis=0))
+    moves = tuple(Move(names[j], float(ends[0][j]), float(ends[1][j]), float("nan")) for j in changes.moving)
+    begin = int(at[first])
+    return Event("gradual" if gradual else "wandering", begin, begin, begin, int(at[last]), None, None, moves)
 
 
-def _wandering(changes: Changes, names: Sequence[str], at: Array) -> Event:
-    theta, nan = changes.found.theta, float("nan")
-    moves = tuple(Move(names[j], float(theta[:, j].min()), float(theta[:, j].max()), nan) for j in changes.moving)
-    return Event("wandering", int(at[0]), int(at[0]), int(at[0]), int(at[-1]), None, None, moves)
-
-
-def clauses(found: Sequence[Event]) -> list[str]:
-    """A clause for each event."""
-    return [_clause(one) for one in found]
-
-
-def _clause(event: Event) -> str:
+def clause(event: Event) -> str:
+    """An event in words."""
     if event.kind == "wandering":
         each = (f"{move.name}, in segments from {move.values[0]} to {move.values[1]}" for move in event.moves)
         return f"a random walk explains it better than steps: {'; '.join(each)}"

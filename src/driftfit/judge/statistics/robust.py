@@ -19,6 +19,10 @@ from driftfit.engine.kernel import Array, shared
 from driftfit.smooth.solvers.rank import column_sizes
 
 CLIP = 1.5
+SMALL = 1e-300
+"""Added to a diagonal, so that it can be inverted."""
+ROUNDED = 1e-14
+"""Information below this share of that of the whole record is rounding."""
 ROUNDS = 30
 SHRINKING = 0.9
 """A scale that in the last round is below this share of the one before vanishes."""
@@ -58,9 +62,9 @@ class Fit(NamedTuple):
 
 
 @shared
-def cholesky(M: Array, n: int, least: float) -> float:
-    """Lower factor of the leading n columns of M (k, k), in place; returns the remaining last entry, M[k-1, k-1].
-    Directions of no more information than ``least`` are left out.
+def eliminate(M: Array, n: int, least: float) -> float:
+    """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal, D^-1 on
+    it; returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
 
     With n = k - 1 and M = [phi, y]' [phi, y] that entry is the sum of squared residuals.
     """
@@ -69,29 +73,28 @@ def cholesky(M: Array, n: int, least: float) -> float:
         pivot = M[j, j]
         size = pivot
         for i in range(j):
-            pivot -= M[j, i] * M[j, i]
-        root = np.sqrt(pivot) if pivot > max(FLAT * size, least) else 0.0
-        M[j, j] = root
+            pivot -= M[j, i] * M[j, i] * M[i, i]
+        M[j, j] = 1.0 / pivot if pivot > max(FLAT * size, least) else 0.0
         for r in range(j + 1, k):
             total = M[r, j]
             for i in range(j):
-                total -= M[r, i] * M[j, i]
-            M[r, j] = total / root if root > 0.0 else 0.0
+                total -= M[r, i] * M[j, i] * M[i, i]
+            M[r, j] = total
     left: float = M[k - 1, k - 1]
     for i in range(n):
-        left -= M[k - 1, i] * M[k - 1, i]
+        left -= M[k - 1, i] * M[k - 1, i] * M[i, i]
     return left if left > 0.0 else 0.0
 
 
 @shared
 def solved(M: Array, theta: Array) -> None:
-    """theta (n,) from M (n + 1, n + 1) after `cholesky`."""
+    """theta (n,) from M (n + 1, n + 1) after `eliminate`."""
     n = theta.shape[0]
     for i in range(n - 1, -1, -1):
-        total = M[n, i]
+        theta[i] = M[n, i]
         for j in range(i + 1, n):
-            total -= M[j, i] * theta[j]
-        theta[i] = total / M[i, i] if M[i, i] > 0.0 else 0.0
+            theta[i] -= M[j, i] * theta[j]
+        theta[i] *= M[i, i]
 
 
 class Basis(NamedTuple):
@@ -113,11 +116,24 @@ class Basis(NamedTuple):
         return bool(np.linalg.matrix_rank(self.R, self.negligible) == len(self.size))
 
 
+def invertible(G: Array, share: Array | float = ROUNDED) -> Array:
+    """Sums of products G (.., q, q), with this share of the mean of their diagonal beside their own."""
+    q = G.shape[-1]
+    mean = np.einsum("...ii->...", G)[..., None, None] / q
+    return np.asarray(G + (mean * share + SMALL) * np.eye(q))
+
+
 def orthonormal(phi: Array) -> Basis:
     """An orthonormal basis of regressors phi (N, n), N > 0."""
     size, root = column_sizes(phi), np.sqrt(len(phi))
     Q, R = np.linalg.qr(phi / size)
     return Basis(np.ascontiguousarray(Q * root), R / root, size)
+
+
+def pseudo_inverse(phi: Array) -> Array:
+    """The pseudo-inverse (n, N) of regressors phi (N, n), whose units may be far apart."""
+    basis = orthonormal(phi)
+    return np.asarray(np.linalg.pinv(basis.R, basis.negligible) / basis.size[:, None] @ basis.Q.T / len(phi))
 
 
 def robust_fit(phi: Array, y: Array) -> Fit:
@@ -143,7 +159,7 @@ def fit_in(basis: Basis, y: Array) -> Fit:
     level = ROUNDING * float(np.sqrt(np.mean(y * y)))
     for round in range(ROUNDS):
         W = Q.T * weight
-        step = np.linalg.lstsq(W @ Q, W @ y, rcond=FLAT)[0]
+        step = np.linalg.solve(invertible(W @ Q), W @ y)
         moved, theta, residual = float(np.abs(Q @ (step - theta)).max()), step, y - Q @ step
         before, scale = scale, deviation(residual)
         vanished = round > 0 and not scale > level

@@ -22,7 +22,7 @@ from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.statistics.robust import deviation
 
 LOUDER = 1e-3
-"""p-value of residuals of one size below which they grow with a regressor."""
+"""p-value, one-sided, of residuals of one size below which they grow with a regressor."""
 
 
 class Whiteness(NamedTuple):
@@ -68,21 +68,19 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
 
 
-def loudest(z: Array, phi: Array) -> int | None:
-    """The regressor of phi (N, n) with which residuals z (N,) grow most clearly; None if they do with none."""
-    p = grows_with(z, phi)
+def ranks(phi: Array) -> Array:
+    """Ranks (N, n) of the sizes of every regressor of phi (N, n), equal ones for equal sizes, about their mean."""
+    sizes = [(one, np.sort(one)) for one in np.abs(phi).T]
+    x = [np.searchsorted(known, one, "left") + np.searchsorted(known, one, "right") for one, known in sizes]
+    return np.asarray((np.array(x) - np.mean(x, axis=1, keepdims=True)).T / (2.0 * len(phi)))
+
+
+def loudest(z: Array, ranked: Array) -> int | None:
+    """The regressor, of those with `ranks` (N, n), with which residuals z (N,) grow most clearly; None if with none."""
+    square = clipped(z) ** 2
+    d = (square - square.mean())[:, None] * ranked
+    total = len(z) * newey_west(d, 0.0)
+    varied = ranked.any(axis=0) & (total > 0.0)
+    p = np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)
     most = int(np.argmin(p))
     return most if p[most] * len(p) < LOUDER else None
-
-
-def grows_with(z: Array, phi: Array) -> Array:
-    """p-values (n,), one-sided, of no larger residuals z (N,) where a regressor of phi (N, n) is larger; 1 for those of
-    constant size."""
-    N, square = len(z), clipped(z) ** 2
-    size = np.abs(phi)
-    below, up_to = ([np.searchsorted(np.sort(one), one, side) for one in size.T] for side in ("left", "right"))
-    x = (np.array(below) + np.array(up_to)).T / (2.0 * N)
-    d = (square - square.mean())[:, None] * (x - x.mean(axis=0))
-    total = N * newey_west(d, 0.0)
-    varied = (np.ptp(size, axis=0) > 0.0) & (total > 0.0)
-    return np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)

@@ -162,7 +162,8 @@ SHARE = 0.001
 
 
 def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
-    """Weights (T, K) of the second of two trackers where both predict, from the ratio of their densities (T, K)."""
+    """Weights (T, K) of one of two predictors where both predict, from the ratio of its density to the other's (T, K);
+    both weigh the same at the ``starts`` of records."""
     T, K = ratio.shape
     now, record = np.full(K, 0.5), 0
     for t in range(T):
@@ -176,7 +177,7 @@ def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
                 now[k] = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now[k] + after)
 
 
-_weigh = Driver(_weights)
+weigh = Driver(_weights)
 
 
 def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
@@ -188,7 +189,7 @@ def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequenc
     both = np.isfinite(first) & np.isfinite(second)
     ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
     weight = np.where(np.isfinite(first), 0.0, 1.0)
-    _weigh(ratio, both, np.array([span.start for span in spans]), weight)
+    weigh(ratio, both, np.array([span.start for span in spans]), weight)
     with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
         terms = np.logaddexp(
             np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),

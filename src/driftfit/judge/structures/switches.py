@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.changes.fit import left
 
 WINDOW = 200
 """Samples on either side of a switch from which its date is estimated."""
@@ -67,19 +68,12 @@ def dated(y: Array, old: Array, new: Array, near: int) -> tuple[int, int, int]:
     if high <= low:
         return near, near, near
     dates = np.arange(low, high + 1)
-    total = np.array([_rest(y[:d], old[:d]) + _rest(y[d:], new[d:]) for d in dates])
+    total = np.array([left(old[:d], y[:d]) + left(new[d:], y[d:]) for d in dates])
     logs = -0.5 * N * np.log(np.maximum(total, 1e-300 + 1e-14 * float(y @ y)))
     share = np.exp(logs - logs.max())
     share = np.cumsum(share / share.sum())
     ends = np.searchsorted(share, [0.025, 0.975])
     return int(dates[np.argmax(logs)]), int(dates[ends[0]]), int(dates[min(ends[1], len(dates) - 1)])
-
-
-def _rest(y: Array, phi: Array) -> float:
-    """Sum of squares that least squares leaves."""
-    theta = np.linalg.lstsq(phi, y, rcond=None)[0]
-    error = y - phi @ theta
-    return float(error @ error)
 
 
 def switches(
