@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_755,
-    "statements": 43_283,
+    "lines of the library": 66_788,
+    "statements": 43_314,
     "modules": 328,
     "levels of folders": 2,
     "constants of modules with numbers": 630,
-    "numbers in the source": 2_428,
+    "numbers in the source": 2_418,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_219,
