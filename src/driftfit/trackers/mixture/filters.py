@@ -26,19 +26,18 @@ from functools import partial
 
 import numpy as np
 
-from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
-    AFTER,
     COMMON,
     DIRECTION,
-    DOWN,
     DRIFT,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
     JUMP,
+    JUMPS,
     OUTLYING,
     STATES,
     WEIGHT,
@@ -46,6 +45,10 @@ from driftfit.trackers.mixture.states import (
     variance_in,
 )
 
+FAR = 9.0
+"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
+STILL = 1e-24
+"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
@@ -57,23 +60,34 @@ LEAST = 1e-100
 """Probability that a mode is never below."""
 
 
+def centring(phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    mean, v, A = phi.mean(axis=0), phi.var(axis=0), np.eye(phi.shape[1])
+    still = v <= STILL * mean**2
+    for k in np.flatnonzero(still & (mean != 0.0))[-1:]:
+        A[k] = np.where(~still & (mean**2 > FAR * v), -mean / mean[k], A[k])
+    return A
+
+
 @partial(kernel, inline=False)
 def walks(s: State, l: int) -> None:
     """The common drift and the learned one in the coordinates z, for a ratio of 1 and r = 1."""
-    n, k = s.parameters[l], s.constant[l]
+    n, k = s.parameters[l], -1
     for a in range(n):
+        k = a if (s.variance[a, l] <= STILL * s.c[a, l]) & (s.mean[a, l] != 0.0) else k
         s.away[1, a, l] = 0.0
         for b in range(a + 1):
             s.walk[0, a, b, l], s.walk[1, a, b, l] = 0.0, 0.0
     for i in range(n):
         root = 1.0 / np.sqrt(s.c[i, l]) if s.c[i, l] > 0.0 else 0.0
-        own = s.sums[WEIGHT, i, l] * root * root
-        rows = i + 1 if s.offset[i, l] == 0.0 else max(i, k) + 1  # S is triangular
-        for a in range(rows):
-            s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
+        own, v = s.sums[WEIGHT, i, l] * root * root, s.variance[i, l]
+        beside = (k >= 0) & (i != k) & (s.c[i, l] > (1.0 + FAR) * v) & (v > STILL * s.c[i, l])
+        unit = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range((max(i, k) if beside else i) + 1):  # S is triangular
+            s.away[0, a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             s.away[1, a, l] += s.S[a, i, l] * s.sums[DIRECTION, i, l] * root
             for b in range(a + 1):
-                s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
+                s.walk[0, a, b, l] += unit * s.away[0, a, l] * s.away[0, b, l]
                 s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]
     for a in range(n):
         for b in range(a + 1):
@@ -81,54 +95,33 @@ def walks(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def wander(s: State, size: float, l: int) -> None:
-    """Drift of all filters by ``size`` times their ratios."""
+def wander(s: State, size: float, jump: float, l: int) -> None:
+    """Drift of all filters by ``size`` times their ratios, and by ``jump`` where these are jumps."""
     n = s.parameters[l]
     walks(s, l)
+    for k in range(s.modes[l]):
+        s.row[k, l] = size * s.ratio[k, l] if s.ratio[k, l] < JUMPS else jump
     for a in range(n):
         for b in range(a + 1):
-            moved = size * s.walk[0, a, b, l]
             for k in range(FIRST_LEARNED):
-                s.C[a, b, k, l] += s.ratio[k, l] * moved
-            moved = size * s.walk[1, a, b, l]
+                s.C[a, b, k, l] += s.row[k, l] * s.walk[0, a, b, l]
             for k in range(FIRST_LEARNED, FIRST_ALONE):
-                s.C[a, b, k, l] += s.ratio[k, l] * moved
+                s.C[a, b, k, l] += s.row[k, l] * s.walk[1, a, b, l]
     for i in range(n):
-        first, own = s.alone[i, l], size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        for a in range(i + 1 if first >= 0 else 0):
+        own = 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range(i + 1 if s.alone[1, i, l] > 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
-                for k in range(first, first + s.rungs[l]):
-                    s.C[a, b, k, l] += s.ratio[k, l] * moved
-
-
-@partial(kernel, short=True)
-def leap(s: State, more: float, l: int) -> None:
-    """The last rungs of jumps get ``more`` variance, in units of the drift; so do gain and variance of the sample."""
-    n, k = s.parameters[l], len(COMMON) - 1
-    for a in range(n):
-        total = 0.0
-        for b in range(n):
-            moved = more * s.walk[0, max(a, b), min(a, b), l]
-            s.C[a, b, k, l] += moved if b <= a else 0.0
-            total += moved * s.x[b, l]
-        s.gain[a, k, l] += total
-        s.h_k[k, l] += total * s.x[a, l]
-    for i in range(n):
-        if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
-            k, own = s.alone[i, l] + s.rungs[l] - 1, more / s.c[i, l]
-            for a in range(i + 1):
-                for b in range(a + 1):
-                    s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
-                s.gain[a, k, l] += own * s.S[a, i, l] * s.white[i, l]
-            s.h_k[k, l] += own * s.white[i, l] * s.white[i, l]
+                for k in range(s.alone[0, i, l], s.alone[1, i, l]):
+                    s.C[a, b, k, l] += s.row[k, l] * moved
 
 
 @kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
     if s.settled[l] > 0 and s.dt[l] > 0.0:
-        wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
+        size = s.r[l] * s.dt[l] * s.drift[l]
+        wander(s, size, JUMPS * size, l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.trend.shape[1]):
             k = len(COMMON) + j
@@ -181,9 +174,7 @@ def innovate(s: State, l: int) -> None:
     v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
-    s.y_hat[l] = mean
-    s.e[l] = s.y[l] - mean
-    s.s[l] = v
+    s.y_hat[l], s.e[l], s.s[l] = mean, s.y[l] - mean, v
 
 
 @partial(kernel, inline=False)
@@ -230,12 +221,14 @@ def weigh(s: State, more: float, l: int) -> None:
     K = s.modes[l]
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
-    square = s.e[l] * s.e[l] / s.noise[l]
-    size = min(max(s.power[l], s.astray[l]), square) - COMMON[-1] * s.r[l]
-    unusual = (size > 0.0) & (s.e[l] * s.e[l] > COMMON[-1] * s.s[l]) & (s.drift[l] > 0.0)
-    if unusual:
-        leap(s, size * s.dt[l] * s.drift[l], l)
-    if more > 0.0 or unusual:
+    size = min(s.power[l], s.e[l] * s.e[l] / s.noise[l]) - JUMPS * s.r[l]
+    leaps = (size > 0.0) & (s.dt[l] * s.drift[l] > 0.0)
+    if leaps:
+        wander(s, 0.0, size, l)
+        project(s, l)
+        for k in range(K):
+            s.e_k[k, l] = s.y[l] - s.explained[l] - s.e_k[k, l]
+    if leaps or more > 0.0:
         likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
@@ -248,7 +241,6 @@ def weigh(s: State, more: float, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
-    s.astray[l] = s.nu[OUTLYING, l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(OUTLYING):
         s.nu[j, l] += s.nu[OUTLYING, l] * s.nu_prior[j, l] / (1.0 - s.nu_prior[OUTLYING, l])
@@ -338,12 +330,10 @@ def mix(s: State, l: int) -> None:
     """
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
-        falls = s.ratio[max(k - 1, 0), l] < s.ratio[k, l]  # the lowest of a ladder stays
-        s.row[k, l] = s.mu[k, l] * (AFTER if s.ratio[k, l] >= 1.0 else DOWN) if falls else 0.0
+        s.row[k, l] = s.mu[k, l] * s.down[k, l]
     s.row[K, l] = 0.0
     for k in range(K):
-        above = s.row[k + 1, l] if s.ratio[min(k + 1, K - 1), l] > s.ratio[k, l] else 0.0
-        stays = (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
+        above, stays = s.row[k + 1, l], (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
         s.mu[k, l] = stays + above + s.arrive[k, l]
         s.step[k, l], s.curve[k, l] = stays / s.mu[k, l], above / s.mu[k, l]
     s.row[K, l] = 0.0
