@@ -53,10 +53,11 @@ def before(lane, phi, jump=JUMPS):
 def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
-    jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
-    mean, restless = x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
-    spread = np.maximum(lane["mu"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
-    return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
+    jump, mean, restless = lane["ratio"] == JUMPS, x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
+    of = np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2
+    usual, wide = (np.average(of[which], weights=lane["mu"][which]) for which in (~jump, jump))
+    noise, p = v[0] ** (1.0 - restless) * v[1] ** restless, lane["mu"][jump].sum()
+    return mean, (noise + usual) ** (1.0 - p) * (noise + wide) ** p
 
 
 def after_jump(lane, phi, y):

@@ -166,12 +166,20 @@ def innovate(s: State, l: int) -> None:
         s.e_k[k, l] += s.explained[l]
         s.row[k, l] = s.mu[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
-    for k in range(K):  # the band is for samples at which no jump begins
-        p = s.mu[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
-        s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
-    v = sum_of_row(s, l) + s.vague[l]
-    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
-    v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
+    for k in range(K):
+        s.curve[k, l] = s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2
+        s.row[k, l] = s.mu[k, l] if s.ratio[k, l] >= JUMPS else 0.0
+    jump = sum_of_row(s, l)
+    for k in range(K):
+        s.row[k, l] *= s.curve[k, l]
+    wide = sum_of_row(s, l) / jump
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * s.curve[k, l] if s.ratio[k, l] < JUMPS else 0.0
+    usual, restless = sum_of_row(s, l) / (1.0 - jump), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
+    # geometric means, because the arithmetic one is that of rare large noise, or of rare jumps
+    noise = variance_in(s, 0, l)
+    noise = noise * exp(restless * log(variance_in(s, 1, l) / noise)) + s.vague[l]
+    v = (noise + usual) * exp(jump * log((noise + wide) / (noise + usual)))
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
     s.y_hat[l], s.e[l], s.s[l] = mean, s.y[l] - mean, v

@@ -38,7 +38,7 @@ JUMPS = 1000.0
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, JUMPS)
 TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
-ALONE, GROUP = (0.003, 0.1, JUMPS), (1e-3, 1e-2, 0.1, 1.0, JUMPS)
+ALONE, GROUP = (0.003, 0.05, 1.0, JUMPS), (1e-3, 1e-2, 0.1, 1.0, JUMPS)
 """Drift ratios of the ladders; that of jumps lasts for a few samples."""
 FLOOR = 0.002
 """Share of the common drift in the learned one."""
