@@ -53,7 +53,7 @@ FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
-UNSURE = 4.5
+UNSURE = 3.0
 """The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
 because the probabilities of the filters, and r, are estimates."""
 LEAST = 1e-100
