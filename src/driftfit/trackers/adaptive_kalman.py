@@ -7,12 +7,13 @@
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
-| learned | the drift covariance found by a backward pass of scores over the last 50 samples | .001, .01, .1, 1 |
+| learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, 1, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
 J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y. It lasts for two
-samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
+samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter. They are merged after every
+sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
 (`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for

@@ -68,7 +68,7 @@ from driftfit.trackers.mixture.states import (
     sum_of_row,
 )
 
-BLOCK, WINDOW = 25, 50
+BLOCK, WINDOW = 20, 40
 """Samples between two passes, and samples of a pass."""
 FADE = 0.985
 """Factor of the sums at every pass."""

@@ -34,8 +34,8 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 
-JUMPS = 1000.0
-COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, JUMPS)
+COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
+JUMPS = max(COMMON)
 TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
 ALONE, GROUP = (0.003, 0.05, 1.0, JUMPS), (1e-3, 1e-2, 0.1, 1.0, JUMPS)
