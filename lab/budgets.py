@@ -28,7 +28,7 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_278,
+    "lines of the library": 67_279,
     "statements": 43_643,
     "modules": 343,
     "levels of folders": 2,
