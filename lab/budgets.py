@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 67_279,
-    "statements": 43_643,
+    "lines of the library": 67_287,
+    "statements": 43_646,
     "modules": 343,
     "levels of folders": 2,
     "constants of modules with numbers": 631,

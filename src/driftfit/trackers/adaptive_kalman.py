@@ -292,7 +292,7 @@ class AdaptiveKalman(Tracker):
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
         rate = np.where(running, drift_ahead(fields["rate"]), 0.0)
-        return centring(phi), noise, rate, groups
+        return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -22,6 +22,7 @@ O(K n^2) for K modes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -60,12 +61,14 @@ LEAST = 1e-100
 """Probability that a mode is never below."""
 
 
-def centring(phi: Array) -> Array:
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
     """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    mean, v, A = phi.mean(axis=0), phi.var(axis=0), np.eye(phi.shape[1])
-    still = v <= STILL * mean**2
-    for k in np.flatnonzero(still & (mean != 0.0))[-1:]:
-        A[k] = np.where(~still & (mean**2 > FAR * v), -mean / mean[k], A[k])
+    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
+    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
+    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
+    for k in np.flatnonzero(constant[-1])[-1:]:
+        mean = phi.mean(axis=0)
+        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
     return A
 
 

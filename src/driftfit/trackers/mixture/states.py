@@ -223,7 +223,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("rate", "usual_noise", "white", "explained", "settled")
+SMOOTHER_FIELDS = ("rate", "usual_noise", "white", "explained", "settled", "mean", "variance", "c")
 """Fields that are stored at every sample."""
 
 
@@ -231,7 +231,12 @@ SMOOTHER_FIELDS = ("rate", "usual_noise", "white", "explained", "settled")
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for i in range(s.c.shape[0]):
-        o.white[i, l] = s.white[i, l]
+        o.white[i, l], o.mean[i, l], o.variance[i, l], o.c[i, l] = (
+            s.white[i, l],
+            s.mean[i, l],
+            s.variance[i, l],
+            s.c[i, l],
+        )
     o.rate[l], o.usual_noise[l] = s.rate[l], s.usual_noise[l]
     o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
 
