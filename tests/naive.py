@@ -62,8 +62,9 @@ def expected(lane, phi):
 
 def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
-    square = (y - expected(lane, phi)[0]) ** 2
-    return before(lane, phi, max(JUMPS, min(lane["power"], square / lane["noise"]) / lane["r"]))
+    mean, variance = expected(lane, phi)
+    square = (y - mean) ** 2 * ((y - mean) ** 2 > of_noise.LARGE * variance)
+    return before(lane, phi, max(JUMPS, min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]))
 
 
 def states(lane):

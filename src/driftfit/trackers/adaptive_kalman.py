@@ -11,9 +11,9 @@
 | single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, 1, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y. It lasts for two
-samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter. They are merged after every
-sample (`driftfit.trackers.mixture.filters`).
+J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y or the last
+outlier. It lasts for two samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter.
+They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
 (`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for

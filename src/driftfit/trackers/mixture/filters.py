@@ -39,6 +39,7 @@ from driftfit.trackers.mixture.states import (
     FLOOR,
     JUMP,
     JUMPS,
+    LARGE,
     OUTLYING,
     STATES,
     WEIGHT,
@@ -232,8 +233,9 @@ def weigh(s: State, more: float, l: int) -> None:
     K = s.modes[l]
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
-    size = min(s.power[l], s.e[l] * s.e[l] / s.noise[l]) - JUMPS * s.r[l]
-    leaps = (size > 0.0) & (s.dt[l] * s.drift[l] > 0.0)
+    square = s.e[l] * s.e[l] / s.noise[l]
+    size = min(max(s.power[l], s.astray[l]), square) - JUMPS * s.r[l]
+    leaps = (size > 0.0) & (s.e[l] * s.e[l] > LARGE * s.s[l]) & (s.dt[l] * s.drift[l] > 0.0)
     if leaps:
         wander(s, 0.0, size, l)
         project(s, l)
@@ -252,6 +254,7 @@ def weigh(s: State, more: float, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
+    s.astray[l] = s.nu[OUTLYING, l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(OUTLYING):
         s.nu[j, l] += s.nu[OUTLYING, l] * s.nu_prior[j, l] / (1.0 - s.nu_prior[OUTLYING, l])

@@ -128,7 +128,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0,
-        "rate": 0.0, "usual_noise": 1.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
