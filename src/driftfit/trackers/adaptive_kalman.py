@@ -291,7 +291,7 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        rate = np.where(running, drift_ahead(fields["rate"]), 0.0)
+        rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
         return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:

@@ -316,7 +316,7 @@ def mixture(s: State, l: int) -> None:
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
-    s.rate[l] = s.r[l] * sum_of_row(s, l)
+    s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]

@@ -128,7 +128,7 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0,
-        "rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "drift_rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
@@ -223,7 +223,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("rate", "usual_noise", "white", "explained", "settled", "mean", "variance", "c")
+SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "settled", "mean", "variance", "c")
 """Fields that are stored at every sample."""
 
 
@@ -237,7 +237,7 @@ def store_for_smoother(o: State, s: State, l: int) -> None:
             s.variance[i, l],
             s.c[i, l],
         )
-    o.rate[l], o.usual_noise[l] = s.rate[l], s.usual_noise[l]
+    o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
     o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
 
 
