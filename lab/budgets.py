@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_718,
-    "statements": 43_261,
+    "lines of the library": 66_722,
+    "statements": 43_263,
     "modules": 328,
     "levels of folders": 2,
     "constants of modules with numbers": 630,

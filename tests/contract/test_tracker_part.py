@@ -47,7 +47,7 @@ def test_steps_serve_every_model_with_as_many_parameters(own_cache):
 def test_steps_that_name_a_field_of_the_model_must_say_so():
     @kernel
     def of_the_model(s, l):
-        s.var[0, l] = s.y_lag[0, l]
+        s.var[0, l] = s.y_lag[0, 0, l]
 
     given = TrackerSteps(still, still, steps()[0], of_the_model, still)
     with pytest.raises(TypeError, match=r"names the field 'y_lag'.*reads_model=True"):

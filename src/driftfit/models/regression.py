@@ -83,6 +83,10 @@ class Regression(CountedInputs):
         return (*((1, j) for j in range(self.m)), *([(1, None)] if self.intercept else []))
 
     @property
+    def output_lags(self) -> int:
+        return 0
+
+    @property
     def terms(self) -> tuple[Term, ...]:
         return (*(("u", j, 0) for j in range(self.m)), *([("1", 0, 0)] if self.intercept else []))
 
