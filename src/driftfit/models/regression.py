@@ -83,7 +83,7 @@ class Regression(CountedInputs):
         return (*((1, j) for j in range(self.m)), *([(1, None)] if self.intercept else []))
 
     @property
-    def output_lags(self) -> int:
+    def reach(self) -> int:
         return 0
 
     @property
