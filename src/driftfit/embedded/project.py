@@ -147,7 +147,7 @@ def _ordinary(unit: Unit) -> Counter[str]:
     if "advance" not in operations:
         return operations["sample"]
     parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
-    return sum(parts, Counter[str]())
+    return sum(parts, Counter[str]()) - operations.get("late", Counter())
 
 
 def _counted(ops: Counter[str]) -> str:
