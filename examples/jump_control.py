@@ -84,7 +84,6 @@ def table(late: int) -> None:
         ("bank, probing", BANK, {"probe": 0.2}),
         ("GPB(2), cautious", MERGED, {}),
         ("default, cautious", AdaptiveKalman(), {}),
-        ("default, caution .3", AdaptiveKalman(), {"caution": 0.3}),
     ):
         found = parts(partial(adaptive, tracker, **how), late)
         print(f"{name:<22}" + "".join(f"{value:>12.3f}" for value in found))
