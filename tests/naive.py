@@ -5,7 +5,7 @@ from scipy import stats
 
 from driftfit.trackers.mixture import filters
 from driftfit.trackers.mixture import states as of_noise
-from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
+from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR
 
 
 def full(lower):
@@ -14,24 +14,22 @@ def full(lower):
     return np.where(np.tri(len(lower), dtype=bool).reshape(lower.shape[:2] + (1,) * (lower.ndim - 2)), lower, other)
 
 
-def walks(lane, jump=JUMPS):
-    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is that of jumps."""
+def walks(lane, jump=COMMON[-1]):
+    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is the last rung."""
     n, c = len(lane["c"]), lane["c"]
-    rho = lane["r"] * np.where(lane["ratio"] == JUMPS, jump, lane["ratio"])
-    mean, v, away = lane["mean"], lane["variance"], np.eye(n)
-    moving = v > filters.STILL * c
-    centred = moving & (c > (1.0 + filters.FAR) * v) & np.any(~moving & (mean != 0.0))
-    if centred.any():
-        constant = np.flatnonzero(~moving & (mean != 0.0))[-1]
-        away[constant] -= np.where(centred, mean / mean[constant], 0.0)
-    common = (away / np.where(centred, v, np.where(c > 0.0, c, np.inf))) @ away.T
+    rho = lane["r"] * np.where(lane["ratio"] == COMMON[-1], jump, lane["ratio"])
+    away = np.eye(n)
+    if lane["offset"].any():
+        away[lane["constant"]] -= lane["offset"]
+    common = (away * lane["drift_unit"]) @ away.T
     a = np.divide(lane["sums"][of_noise.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
     learned = np.diag(lane["sums"][of_noise.WEIGHT] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
-    for i, (first, end) in enumerate(lane["alone"].T):
-        Q[first:end, i, i] = inverse[i]
+    for i, first in enumerate(lane["alone"]):
+        if first >= 0:
+            Q[first : first + lane["rungs"], i, i] = inverse[i]
     return rho[:, None, None] * Q
 
 
@@ -42,7 +40,7 @@ def moved_along(lane, time=1.0):
     return m
 
 
-def before(lane, phi, jump=JUMPS):
+def before(lane, phi, jump=COMMON[-1]):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
     S, r = lane["S"], lane["r"]
     C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
@@ -53,23 +51,27 @@ def before(lane, phi, jump=JUMPS):
 def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
-    jump, mean, restless = lane["ratio"] == JUMPS, x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
-    of = np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2
-    usual, wide = (np.average(of[which], weights=lane["mu"][which]) for which in (~jump, jump))
-    noise, p = v[0] ** (1.0 - restless) * v[1] ** restless, lane["mu"][jump].sum()
-    return mean, (noise + usual) ** (1.0 - p) * (noise + wide) ** p
+    jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
+    mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
+    spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
+    return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
 
 
 def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
-    square = (y - mean) ** 2 * ((y - mean) ** 2 > of_noise.LARGE * variance)
-    return before(lane, phi, max(JUMPS, min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]))
+    square = (y - mean) ** 2
+    jump = (
+        min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]
+        if square > COMMON[-1] * variance
+        else 0.0
+    )
+    return before(lane, phi, max(COMMON[-1], jump))
 
 
 def states(lane):
     """Probabilities (3,) of the states of the noise before a sample."""
-    (quiet, restless, _), o = lane["nu"], lane["nu_prior"][OUTLYING]
+    (quiet, restless, _), o = lane["nu"], lane["outlying"]
     usual = np.array([[of_noise.STAY, 1.0 - of_noise.STAY], [1.0 - of_noise.CALM, of_noise.CALM]])
     return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
 
@@ -78,7 +80,7 @@ def density(lane, phi, y):
     """The predictive density of y, of any shape: Student's while r rests on few samples, and a Cauchy tail."""
     (x, m, C, v), total, count = before(lane, phi), 0.0, float(lane["count"])
     body = stats.norm if count > filters.STUDENT else stats.t(count)
-    for k, weight in enumerate(lane["mu"]):
+    for k, weight in enumerate(lane["prior"]):
         e, h = y - x @ m[:, k], x @ C[k] @ x
         for j, p in enumerate(states(lane)):
             law = stats.cauchy if j == 2 else body
@@ -89,12 +91,12 @@ def density(lane, phi, y):
 
 def sample(lane, phi, y):
     """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
-    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["mu"]), float(lane["count"])
+    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["prior"]), float(lane["count"])
     e, g = y - x @ m, C @ x
     h = g @ x
     s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])
     kernel = np.exp(-0.5 * e**2 / s) if count > filters.STUDENT else (1.0 + e**2 / s / count) ** (-0.5 * (count + 1.0))
-    joint = lane["mu"] * states(lane)[:, None] * kernel / np.sqrt(s)
+    joint = lane["prior"] * states(lane)[:, None] * kernel / np.sqrt(s)
     joint /= joint.sum()
     mu = np.maximum(joint.sum(axis=0), filters.LEAST)
     a, a2 = (joint / s).sum(axis=0) / mu, (joint / s**2).sum(axis=0) / mu
@@ -105,7 +107,8 @@ def sample(lane, phi, y):
 
 def interaction(lane, mu, m, C):
     """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
-    arrive, down = lane["arrive"], lane["down"]
+    ratio, arrive = lane["ratio"], lane["arrive"]
+    down = np.where(ratio >= 1.0, of_noise.AFTER, of_noise.DOWN) * np.append(False, np.diff(ratio) > 0.0)
     T = np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive
     share = mu[:, None] * T
     prior = share.sum(axis=0)

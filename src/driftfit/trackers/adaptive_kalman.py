@@ -7,21 +7,19 @@
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .001, .01, .1 |
-| learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
-| single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, 1, J |
+| learned | the drift covariance found by a backward pass of scores over the last 50 samples | .001, .01, .1, 1 |
+| single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, J |
 | group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
 
-J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y or the last
-outlier. It lasts for two samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter.
-They are merged after every sample (`driftfit.trackers.mixture.filters`).
+J, the largest jump, is 30. Where e^2 > 30 s it is e^2 / r, but no more than the mean square of y or the last outlier.
+Every mode is a Kalman filter. They are merged after every sample (`driftfit.trackers.mixture.filters`).
 Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
 (`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
 (`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
 this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
-estimates themselves. The variance before a sample is for samples that are no outliers: the geometric mean, by their
-probabilities, of the variances with and without a jump in the last samples.
+estimates themselves. The variance before a sample is for samples that are no outliers, and at which no jump begins.
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
 Student's (`driftfit.trackers.student`). Every filter starts from generalised least squares with its own
@@ -32,7 +30,7 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 15 + 4 n for two to eight parameters, and 15 for more.
+sample: O(K n^2) for K modes; without groups K = 15 + 3 n for two to eight parameters, and 15 for more.
 """
 
 from __future__ import annotations
@@ -51,12 +49,14 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
     FRAME,
     frame,
+    located,
     located_within,
     unseen_variance,
+    whiten,
     whiten_within,
 )
 from driftfit.trackers.forms.covariance import prediction
-from driftfit.trackers.forms.diffuse import ENTERING, knowing_nothing, spanned_variance
+from driftfit.trackers.forms.diffuse import knowing_nothing, spanned_variance
 from driftfit.trackers.forms.excitation import (
     FIRST,
     learn_information,
@@ -67,18 +67,10 @@ from driftfit.trackers.forms.excitation import (
     window,
 )
 from driftfit.trackers.forms.information import partly_known
-from driftfit.trackers.mixture.filters import (
-    centring,
-    enter_filters,
-    innovate,
-    mix,
-    mixture,
-    predict,
-    update_filters,
-    weigh,
-)
+from driftfit.trackers.mixture.filters import enter_filters, innovate, mix, mixture, predict, update_filters, weigh
 from driftfit.trackers.mixture.learned import (
     begin_with_drift,
+    centring,
     colour,
     forecast_start,
     learn_colour,
@@ -92,7 +84,6 @@ from driftfit.trackers.mixture.learned import (
 )
 from driftfit.trackers.mixture.states import (
     MOST_ALONE,
-    OUTLYING,
     SMOOTHER_FIELDS,
     any_noise,
     bank,
@@ -105,6 +96,22 @@ from driftfit.trackers.mixture.states import (
     store_for_smoother,
 )
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
+
+
+@kernel
+def interact(s: State, l: int) -> None:
+    if s.ok[l] > 0.0:
+        # now, not before the next sample: its prediction may not depend on whether its output will be there
+        mix(s, l)
+
+
+@kernel
+def go_on(s: State, l: int) -> None:
+    """The estimate of the mixture, and the interaction of the filters, while columns may be free."""
+    if s.ok[l] > 0.0:
+        located_within(s, l)
+    interact(s, l)
+    unseen_variance(s, l)
 
 
 @partial(kernel, short=True)
@@ -120,16 +127,17 @@ def settle(s: State, l: int) -> None:
     frame(s, l)
     begin_with_drift(s, least_noise(s, l), l)
     s.usual_noise[l] = s.r[l]
+    mixture(s, l)
+    go_on(s, l)
 
 
 @partial(kernel, inline=False)
-def look_ahead(s: State, l: int) -> None:
-    """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
-    whiten_noise(s, l)
-    column = whiten_within(s, s.white.ctypes.data, l)
+def look_ahead(s: State, entering: int, l: int) -> None:
+    """Prediction of the running filters, and its variance; ``entering`` is the column in a new direction, or -1."""
+    s.column[l] = entering
     noise_prior(s, l)
     innovate(s, l)
-    if column >= 0:
+    if entering >= 0:
         s.y_hat[l] = prediction(s, l)
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
 
@@ -137,9 +145,9 @@ def look_ahead(s: State, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.nu[OUTLYING, l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
+    s.outlier[l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
     note_reading(s, l)
-    column = int(s.at_start[ENTERING, l])
+    column = s.column[l]
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
     elif s.ok[l] > 0.0:
@@ -148,6 +156,9 @@ def follow(s: State, l: int) -> None:
         update_filters(s, l)
         learn_drift(s, l)
         learn_noise(s, l)
+    else:
+        for k in range(s.modes[l]):
+            s.mu[k, l] = s.prior[k, l]
     learn_colour(s, weighed, l)
     learn_scales(s, l)
     learn_means(s, l)
@@ -156,44 +167,58 @@ def follow(s: State, l: int) -> None:
 
 @kernel
 def forecast(s: State, l: int) -> None:
-    """Of the filters, and of least squares until they start."""
+    whiten_noise(s, l)
+    whiten(s, l)
+    look_ahead(s, -1, l)
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    follow(s, l)
+
+
+@kernel
+def report(s: State, l: int) -> None:
+    mixture(s, l)
+    if s.ok[l] > 0.0:
+        located(s, l)
+    interact(s, l)
+
+
+@kernel
+def forecast_first(s: State, l: int) -> None:
+    """That of least squares until the filters start; afterwards of the running filters, while there are directions
+    without information.
+    """
     if s.settled[l] > 0:
-        look_ahead(s, l)
+        whiten_noise(s, l)
+        look_ahead(s, whiten_within(s, s.white.ctypes.data, l), l)
     else:
         forecast_start(s, l)
         s.s[l] *= wider(s.count[l])
 
 
 @kernel
-def correct(s: State, l: int) -> None:
+def correct_first(s: State, l: int) -> None:
     if s.settled[l] > 0:
         follow(s, l)
-        return
-    residuals = s.count[l]
-    take_start(s, l)
-    if s.h[l] < np.inf:
-        s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
-    n = s.parameters[l]
-    rank = s.rank[l] - (s.theta.shape[0] - n)  # without the parameters that are known
-    # a column that enters late, as of signals that a model has to compute first, has no residuals yet
-    early = rank == n and s.remembered[l] <= n + RESIDUALS
-    enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
-    spanned_variance(s, l)
-    if enough and s.remembered[l] - rank >= RESIDUALS:
-        settle(s, l)
-    else:
-        widen_estimates(s, l)
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    if s.settled[l] > 0:
         mixture(s, l)
-        if s.ok[l] > 0.0:
-            located_within(s, l)
-            # now, not before the next sample: its prediction may not depend on whether its output will be there
-            mix(s, l)
-        unseen_variance(s, l)
+        go_on(s, l)
+    else:
+        residuals = s.count[l]
+        take_start(s, l)
+        if s.h[l] < np.inf:
+            s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
+        n = s.parameters[l]
+        rank = s.rank[l] - (s.theta.shape[0] - n)  # without the parameters that are known
+        # a column that enters late, as of signals that a model has to compute first, has no residuals yet
+        early = rank == n and s.remembered[l] <= n + RESIDUALS
+        enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
+        spanned_variance(s, l)
+        if enough and s.remembered[l] - rank >= RESIDUALS:
+            settle(s, l)
+        else:
+            widen_estimates(s, l)
 
 
 @kernel
@@ -226,8 +251,8 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away", "W",
+        "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
+        "away", "W", "nu_prior",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 
@@ -253,8 +278,11 @@ class AdaptiveKalman(Tracker):
             "density": np.nan,
             "r": 1.0,
             "scale": np.nan,
+            "squares": 0.0,
             "count": 0.0,
+            "waited": 0.0,
             "settled": 0,
+            "column": -1,
             "shift": 0.0,
             "vague": 0.0,
             **knowing_nothing(n),
@@ -275,6 +303,7 @@ class AdaptiveKalman(Tracker):
             correct,
             report,
             nothing,
+            TrackerSteps(predict, forecast_first, correct_first, nothing, nothing),
             store=keep_density,
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_drift),
@@ -291,8 +320,8 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
-        return centring(fields, phi), noise, rate, groups
+        rate = fields["r"] * drift_ahead(self.state(n)["ratio"], fields["mu"])
+        return centring(fields, phi), noise, np.where(running, rate, 0.0), groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:
