@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_722,
-    "statements": 43_263,
+    "lines of the library": 66_792,
+    "statements": 43_316,
     "modules": 328,
     "levels of folders": 2,
     "constants of modules with numbers": 630,
-    "numbers in the source": 2_417,
+    "numbers in the source": 2_418,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_219,
@@ -45,10 +45,10 @@ LIMITS = {
     "state fields of Kalman": 36,
     "state fields of RLS": 46,
     "state fields of FLS": 39,
-    "state fields of AdaptiveKalman": 86,
+    "state fields of AdaptiveKalman": 95,
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
-    "bytes of state of AdaptiveKalman": 12_080,
+    "bytes of state of AdaptiveKalman": 12_112,
     "lines of tests": 33_671,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
