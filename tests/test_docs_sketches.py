@@ -25,6 +25,7 @@ GIVEN = {
         fleet = track(model, tracker, y="flow", u="pressure", data=table, by="pump")
         """,
     "many_meters.md": "",
+    "real_sensors.md": "",
     "segmentation.md": """
         y = y + 9.0 * (np.arange(len(y)) >= 500)
         run = track(ARX(1, 1, intercept=True), tracker, y, u)
@@ -33,7 +34,7 @@ GIVEN = {
         qs, fast, slow = (1e-3, 1e-4), RLS(0.9), RLS(0.99)
         Y, U = np.stack([y, 2 * y]), np.stack([u, u])
         """,
-    "tracking.md": "flow, pressure = y, u",
+    "tracking.md": "flow, pressure, y_t, u_t = y, u, y[0], u[0]",
     "tuning.md": "model, u = Regression(2), np.column_stack([u, np.roll(u, 1)])",
     "verdict.md": "",
 }

@@ -110,11 +110,8 @@ def test_rows_of_one_instant_are_one_vector_measurement():
     assert run.prediction.shape == (60, 2)
     assert run.theta.shape == (60, 2)
     path = run.smooth(keep="cov")
-    rows = path.rows.theta
-    np.testing.assert_allclose(rows[::2], rows[1::2], rtol=1e-12)
-    np.testing.assert_array_equal(path.theta, rows[1::2])
     assert path.theta.shape == path.std.shape == run.theta.shape
-    assert path.residual.shape == path.loo.shape == path.leverage.shape == path.rows.run.y.reshape(60, 2).shape
+    assert path.residual.shape == path.loo.shape == path.leverage.shape == path.weight.shape == y.shape
     np.testing.assert_allclose(path.residual, y - np.einsum("tkn,tn->tk", phi, path.theta), atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.diag(path.cov(-1))), path.std[-1], rtol=1e-12)
     np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9)  # all samples are known there

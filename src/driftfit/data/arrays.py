@@ -184,7 +184,7 @@ def named_outputs(model: Model, names: Sequence[str]) -> tuple[Model, list[int]]
     ny = len(model.outputs)
     if len(names) != ny:
         return model, list(range(ny))
-    if isinstance(getattr(model, "ny", None), int):
+    if isinstance(model.settings().get("ny"), int):
         return replace(model, ny=tuple(names)), list(range(ny))  # type: ignore[type-var]
     return model, order_of(type(model).__name__, model.outputs, names, "outputs")
 

@@ -194,12 +194,13 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
         if count > 2 * longest:
             _multiplied(v, G)
     else:
-        at = complete(ok, np.arange(1, longest + 1))
+        while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
+            longest -= 1  # fewer lags are known of more rows
         rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
         count, G = len(at), rows.T @ rows
     if count <= 2 * longest:
         return NONE
-    _chosen(G, count, most, found)
+    _chosen(G, count, min(most, longest), found)
     lags = np.arange(1, found[0] + 1)
     return np.append(lags, found[1]) if found[1] else lags
 
