@@ -16,7 +16,7 @@ import numpy as np
 
 from driftfit import ARX, GPB, AdaptiveKalman, Bank, Change, Kalman, Live, Sensor
 
-NOISE, T, RUNS, LIMIT = 0.1, 180, 8, 10.0
+NOISE, T, RUNS, LIMIT = 0.1, 180, 20, 10.0
 CHANGES, KNOWN = [Change(1e-6), Change(1.0, prob=0.01, which=[1], name="gain")], [Sensor.nominal(NOISE**2)]
 BANK, MERGED = Bank(CHANGES, KNOWN, p0=1.0), Bank(CHANGES, KNOWN, reduce=GPB(2), p0=1.0)
 KALMAN = Kalman(q=[1e-6, 0.01], r=NOISE**2, p0=1.0)
