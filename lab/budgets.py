@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_792,
-    "statements": 43_316,
+    "lines of the library": 66_793,
+    "statements": 43_317,
     "modules": 328,
     "levels of folders": 2,
     "constants of modules with numbers": 630,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 12_112,
-    "lines of tests": 33_671,
+    "lines of tests": 33_669,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
