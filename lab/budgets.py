@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_793,
-    "statements": 43_317,
+    "lines of the library": 66_815,
+    "statements": 43_333,
     "modules": 328,
     "levels of folders": 2,
-    "constants of modules with numbers": 630,
-    "numbers in the source": 2_418,
+    "constants of modules with numbers": 631,
+    "numbers in the source": 2_419,
     "private names of Numba and llvmlite": 30,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_219,

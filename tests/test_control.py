@@ -151,7 +151,7 @@ def test_inputs_are_held_where_nothing_can_be_planned() -> None:
         (ARX(1, 1), KALMAN, {"limits": (1.0, -1.0)}, "limits are (low, high)"),
         (ARX(1, 1), KALMAN, {"effort": -1.0}, "effort"),
         (ARX(1, 1), KALMAN, {"horizon": 0}, "h must be a whole number"),
-        (ARX(1, 1), KALMAN, {"u": [5.0, np.nan], "horizon": 2, "limits": (-1, 1), "move": 0.1}, "contradict"),
+        (ARX(1, 1), KALMAN, {"u": [5.0, np.nan], "horizon": 2, "limits": (-1, 1), "move": 0.1}, "leave none within"),
     ],
 )
 def test_what_cannot_be_planned_is_refused(model: ARX, tracker: object, how: dict[str, object], message: str) -> None:

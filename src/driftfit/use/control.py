@@ -44,6 +44,10 @@ from driftfit.use.forecast import future
 LIGHT = 1e-8
 """Cost of changing an input, as a share of the curvature of J: one without effect stays as it is."""
 
+SCALINGS, MISSED = 3, 0.01
+"""Solutions of a problem of least distance, each in the unit of the one before; the share of a move by which rounding
+may miss an input that is given."""
+
 
 @printing
 class Plan(NamedTuple):
@@ -190,7 +194,7 @@ def _cheapest(short: Array, effect: Array, cost: float, inputs: Inputs) -> Array
     before = np.zeros(v.size)
     before[: len(inputs.last)] = inputs.last
     A = effect.reshape(-1, v.size)  # a sum over the points; J has a mean
-    weight = np.sqrt(len(short) * cost + LIGHT * max(np.max(np.sum(A**2, axis=0)), np.finfo(float).tiny))
+    weight = np.sqrt(len(short) * cost + LIGHT * (float(np.max(np.sum(A**2, axis=0))) or 1.0))
     A, b = np.vstack([A, weight * D]), np.concatenate([short.ravel(), weight * before])
     moves = np.tile(inputs.move, len(inputs.given))
     G = np.vstack([np.eye(v.size), -np.eye(v.size), D, -D])
@@ -198,6 +202,21 @@ def _cheapest(short: Array, effect: Array, cost: float, inputs: Inputs) -> Array
     b, h = b - A[:, ~free] @ v[~free], h - G[:, ~free] @ v[~free]
     used = np.isfinite(h) & G[:, free].any(axis=1)
     v[free] = _least_distance(A[:, free], b, G[np.ix_(used, free)], h[used])
+    return _kept(v.reshape(inputs.given.shape), inputs).ravel()
+
+
+def _kept(v: Array, inputs: Inputs) -> Array:
+    """The inputs (h, m), exactly within limits and moves, which a solution may miss by rounding."""
+    before, room = inputs.last, (1.0 + MISSED) * inputs.move
+    for k, free in enumerate(np.isnan(inputs.given)):
+        low, high = np.maximum(inputs.low[k], before - inputs.move), np.minimum(inputs.high[k], before + inputs.move)
+        before_free = free if k == 0 else np.isnan(inputs.given[k - 1])
+        if (free & (low > high + MISSED * inputs.move)).any() or (
+            ~free & before_free & (k > 0) & (np.abs(v[k] - before) > room)
+        ).any():
+            raise ValueError("control: the inputs given as u= leave none within the limits and moves.")
+        v[k] = np.where(free, np.clip(v[k], low, high), v[k])
+        before = v[k]
     return v
 
 
@@ -213,12 +232,15 @@ def _least_distance(A: Array, b: Array, G: Array, h: Array) -> Array:
     short = h - G @ x
     size = np.linalg.norm(rows, axis=1)
     rows, short = rows / size[:, None], short / size
-    scale = np.max(short)
-    E = np.vstack([rows.T, short / scale])
-    r = E @ nnls(E, np.eye(len(E))[-1], maxiter=100 * len(h))[0] - np.eye(len(E))[-1]
-    if -r[-1] < 1e-12:
-        raise ValueError("control: no inputs are within the limits and moves; the inputs given as u= contradict them.")
-    return np.asarray(x + np.linalg.solve(R, -scale * r[:-1] / r[-1]))
+    distance, z = float(np.max(short)), np.zeros(len(x))
+    for _ in range(SCALINGS):  # digits are lost unless |z| is about 1 in the unit of the problem
+        E = np.vstack([rows.T, short / distance])
+        r = E @ nnls(E, np.eye(len(E))[-1], maxiter=100 * len(h))[0] - np.eye(len(E))[-1]
+        if not -r[-1] > 0.0:
+            break
+        z = -distance * r[:-1] / r[-1]
+        distance = max(float(np.linalg.norm(z)), distance)
+    return np.asarray(x + np.linalg.solve(R, z))
 
 
 def _probing(v: Array, j: int, share: float, rest: Array, effect: Array, inputs: Inputs) -> float:

@@ -27,7 +27,7 @@ LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
-DOUBT = 1.5
+PRICE_ERRORS = 1.5
 """Standard errors by which a price is changed to see whether the number depends on more draws."""
 SWEEPS = 4
 RANK = 1e-12
@@ -153,7 +153,7 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
             if most > len(drawn) < count:
                 drawn = np.vstack([drawn, draws.gains(*constants, count - len(drawn))])
             (one, error), (two, other) = (price(each, level / SHARE) for each in drawn.T)
-            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (DOUBT, -DOUBT))
+            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (PRICE_ERRORS, -PRICE_ERRORS))
             if len(drawn) >= DRAWS[1] and few == many:
                 break
         return stepwise(gain, (one, two)) or first, (one, two)
