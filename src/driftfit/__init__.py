@@ -39,6 +39,7 @@ from driftfit.results import Track
 from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
+from driftfit.smooth.local_shrinkage import local_shrinkage
 from driftfit.smooth.piecewise import piecewise
 from driftfit.smooth.total_variation import total_variation
 from driftfit.streams import Live
@@ -123,6 +124,7 @@ __all__ = [
     "huber",
     "identify",
     "likelihood_ratio",
+    "local_shrinkage",
     "piecewise",
     "plot_tree",
     "pool",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from driftfit.bank.reduction import Hybrid
 from driftfit.bank.results.events import LEVEL, Event, Probabilities, Span, changes_of
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.smooth.mixture import Mixture
 from driftfit.smooth.problem import walk_of
 from driftfit.smooth.unknown_drift import PER_SAMPLE
 
@@ -34,8 +34,19 @@ def changes(run: Track, threshold: float) -> list[Event]:
     return dated(run, found, np.full((len(run), 1), 1.0 - PER_SAMPLE), names, threshold, Hybrid.remembered, [])
 
 
+class Moves(Protocol):
+    """What is known of the moves of a path."""
+
+    @property
+    def events(self) -> Array:
+        """(T, E): probabilities of the events before each sample, none of them first."""
+
+    def increment(self, first: int, last: int) -> tuple[Array, Array]:
+        """Mean and standard deviation (n,) of how far theta moved at these samples."""
+
+
 def dated(
-    run: Track, found: Mixture, prior: Array, names: Sequence[str], threshold: float, W: int, known: Sequence[Span]
+    run: Track, found: Moves, prior: Array, names: Sequence[str], threshold: float, W: int, known: Sequence[Span]
 ) -> list[Event]:
     """Changes more probable than the threshold within W samples, with credible sets of dates, sizes, and times.
 

@@ -12,6 +12,8 @@ Use it if parameters are constant between changes and the segments are of intere
 
 from __future__ import annotations
 
+from itertools import pairwise
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from driftfit.bank.results.results import Hypotheses
 from driftfit.bank.results.smoothed import faulty
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.smooth.plots import plot_segments
+from driftfit.show.axes import BLUE, GREY, date_axis, frame, panels, settled, time_label
 from driftfit.smooth.problem import replay
 from driftfit.smooth.solvers.rank import column_sizes
 
@@ -96,7 +98,24 @@ class Segments:
 
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters of the segments with bands, over the tracked path. ``ax`` as for `Track.plot`."""
-        return plot_segments(self.run, self.bounds.tolist(), self.theta, self.std, level, ax)
+        run, n = self.run, len(self.names)
+        figure, axes = panels(ax, (9.0, 1.7 * n + 0.8), n, sharex=True)
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        for i, axis in enumerate(axes):
+            axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, label="tracked")
+            for k, (a, b) in enumerate(pairwise(self.bounds.tolist())):
+                reach, value = run.time[[a, b - 1]], self.theta[k, i]
+                axis.plot(reach, [value, value], color=BLUE, lw=1.6, label="segment" if k == 0 else None)
+                if np.isfinite(half[k, i]):
+                    axis.fill_between(reach, value - half[k, i], value + half[k, i], color=BLUE, alpha=0.2, lw=0)
+            low, high = self.theta[:, i] - half[:, i], self.theta[:, i] + half[:, i]
+            frame(axis, np.concatenate([low, high, run.theta[settled(run), i]]))
+            axis.set_ylabel(run.names[i])
+            axis.grid(alpha=0.25, lw=0.5)
+        axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
+        axes[-1].set_xlabel(time_label(run))
+        date_axis(axes[-1], run)
+        return figure
 
 
 def piecewise(run: Track, breaks: Any = None, r: float | None = None) -> Segments:
