@@ -39,6 +39,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_LEARNED,
     FLOOR,
     JUMP,
+    OUTLYING,
     STATES,
     WEIGHT,
     sum_of_row,
@@ -170,13 +171,13 @@ def innovate(s: State, l: int) -> None:
     project(s, l)
     for k in range(K):
         s.e_k[k, l] += s.explained[l]
-        s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
+        s.row[k, l] = s.mu[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
     for k in range(K):  # the band is for samples at which no jump begins
-        p = s.prior[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        p = s.mu[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l) + s.vague[l]
-    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
+    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
     v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
@@ -194,23 +195,23 @@ def likelihoods(s: State, more: float, l: int) -> None:
     few = s.count[l]
     for j in range(STATES):
         noise = variance_in(s, j, l) + more
-        widest = np.inf if j == STATES - 1 else 0.0
+        widest = np.inf if j == OUTLYING else 0.0
         for k in range(s.modes[l]):
             square = s.e_k[k, l] * s.e_k[k, l]
             v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
             far = square * v if few > STUDENT else (few + 1.0) * log(1.0 + square * v / few)
             s.inverse[j, k, l] = v
-            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
+            s.joint[j, k, l] = s.mu[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
 
 
 @partial(kernel, inline=False)
 def predictive_density(s: State, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
     K, few = s.modes[l], s.count[l]
-    noise = variance_in(s, STATES - 1, l) + s.vague[l]
+    noise = variance_in(s, OUTLYING, l) + s.vague[l]
     for k in range(K):
         v = s.h_k[k, l] + noise
-        s.row[k, l] = s.prior[k, l] * s.nu_prior[STATES - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+        s.row[k, l] = s.mu[k, l] * s.nu_prior[OUTLYING, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
     tail = log(sum_of_row(s, l) / np.pi)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
@@ -247,11 +248,10 @@ def weigh(s: State, more: float, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
-    s.outlier[l] = s.nu[STATES - 1, l]
-    s.astray[l] = s.outlier[l] * square
+    s.astray[l] = s.nu[OUTLYING, l] * square
     # an outlier says nothing about the state of ordinary noise
-    for j in range(STATES - 1):
-        s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
+    for j in range(OUTLYING):
+        s.nu[j, l] += s.nu[OUTLYING, l] * s.nu_prior[j, l] / (1.0 - s.nu_prior[OUTLYING, l])
 
 
 @partial(kernel, inline=False)
@@ -280,8 +280,6 @@ def update_filters(s: State, l: int) -> None:
         spread = max(part * (p * u * u + q * v * v + o * w * w) - a * a, 0.0)
         s.step[k, l] = a * s.e_k[k, l]
         s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
-        s.row[k, l] = s.mu[k, l] * a
-    s.precision[l] = sum_of_row(s, l)
     absorb(s, l)
     for j in range(s.trend.shape[1]):
         k = len(COMMON) + j
@@ -299,7 +297,6 @@ def enter_filters(s: State, j: int, l: int) -> None:
     for t in range(s.trend.shape[1]):
         s.trend[j, t, l] = 0.0
     for k in range(K):
-        s.mu[k, l] = s.prior[k, l]
         for i in range(n):
             s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]
         s.m[j, k, l] = sign * s.e_k[k, l]
@@ -311,6 +308,9 @@ def enter_filters(s: State, j: int, l: int) -> None:
 def mixture(s: State, l: int) -> None:
     """Mean d of the filters, and the covariance of theta that is reported; without a sample d keeps its bits."""
     n, K = s.parameters[l], s.modes[l]
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
+    s.rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
@@ -344,8 +344,8 @@ def mix(s: State, l: int) -> None:
     for k in range(K):
         above = s.row[k + 1, l] if s.ratio[min(k + 1, K - 1), l] > s.ratio[k, l] else 0.0
         stays = (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
-        s.prior[k, l] = stays + above + s.arrive[k, l]
-        s.step[k, l], s.curve[k, l] = stays / s.prior[k, l], above / s.prior[k, l]
+        s.mu[k, l] = stays + above + s.arrive[k, l]
+        s.step[k, l], s.curve[k, l] = stays / s.mu[k, l], above / s.mu[k, l]
     s.row[K, l] = 0.0
     for a in range(n):
         for k in range(K):
