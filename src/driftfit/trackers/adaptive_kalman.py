@@ -65,10 +65,18 @@ from driftfit.trackers.forms.excitation import (
     window,
 )
 from driftfit.trackers.forms.information import partly_known
-from driftfit.trackers.mixture.filters import enter_filters, innovate, mix, mixture, predict, update_filters, weigh
+from driftfit.trackers.mixture.filters import (
+    centring,
+    enter_filters,
+    innovate,
+    mix,
+    mixture,
+    predict,
+    update_filters,
+    weigh,
+)
 from driftfit.trackers.mixture.learned import (
     begin_with_drift,
-    centring,
     colour,
     forecast_start,
     learn_colour,
@@ -243,7 +251,6 @@ class AdaptiveKalman(Tracker):
             "density": np.nan,
             "r": 1.0,
             "scale": np.nan,
-            "squares": 0.0,
             "count": 0.0,
             "settled": 0,
             "shift": 0.0,
@@ -282,7 +289,7 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        rate = np.where(running, drift_ahead(fields["rate"]), 0.0)
+        rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
         return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:

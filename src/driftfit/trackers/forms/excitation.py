@@ -49,13 +49,9 @@ DOUBT = 0.05
 """Samples of excitation that a sample without it cancels while the scale rests on few."""
 
 
-WINDOW = 50
-"""Least number of samples in the window of G."""
-
-
 def window(n: int) -> int:
     """Number of samples in the window of G."""
-    return max(WINDOW, 10 * n)
+    return max(int(MEMORY), 10 * n)
 
 
 def no_excitation(n: int) -> dict[str, Any]:
@@ -99,7 +95,7 @@ def learn_information(s: State, noise: float, l: int) -> None:
     ``noise``: those that the guard against constant inputs examines.
     """
     n = s.theta.shape[0]
-    fade = 1.0 - 1.0 / max(WINDOW, 10.0 * s.parameters[l])
+    fade = 1.0 - 1.0 / max(MEMORY, 10.0 * s.parameters[l])
     for i in range(n):
         for j in range(i + 1):
             unit = s.c[i, l] * s.c[j, l]

@@ -22,11 +22,12 @@ O(K n^2) for K modes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
 
-from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
@@ -46,6 +47,10 @@ from driftfit.trackers.mixture.states import (
     variance_in,
 )
 
+FAR = 9.0
+"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
+STILL = 1e-24
+"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
@@ -57,23 +62,36 @@ LEAST = 1e-100
 """Probability that a mode is never below."""
 
 
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
+    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
+    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
+    for k in np.flatnonzero(constant[-1])[-1:]:
+        mean = phi.mean(axis=0)
+        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
+    return A
+
+
 @partial(kernel, inline=False)
 def walks(s: State, l: int) -> None:
     """The common drift and the learned one in the coordinates z, for a ratio of 1 and r = 1."""
-    n, k = s.parameters[l], s.constant[l]
+    n, k = s.parameters[l], -1
     for a in range(n):
+        k = a if (s.variance[a, l] <= STILL * s.c[a, l]) & (s.mean[a, l] != 0.0) else k
         s.away[1, a, l] = 0.0
         for b in range(a + 1):
             s.walk[0, a, b, l], s.walk[1, a, b, l] = 0.0, 0.0
     for i in range(n):
         root = 1.0 / np.sqrt(s.c[i, l]) if s.c[i, l] > 0.0 else 0.0
-        own = s.sums[WEIGHT, i, l] * root * root
-        rows = i + 1 if s.offset[i, l] == 0.0 else max(i, k) + 1  # S is triangular
-        for a in range(rows):
-            s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
+        own, v = s.sums[WEIGHT, i, l] * root * root, s.variance[i, l]
+        beside = (k >= 0) & (i != k) & (s.c[i, l] > (1.0 + FAR) * v) & (v > STILL * s.c[i, l])
+        unit = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range((max(i, k) if beside else i) + 1):  # S is triangular
+            s.away[0, a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             s.away[1, a, l] += s.S[a, i, l] * s.sums[DIRECTION, i, l] * root
             for b in range(a + 1):
-                s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
+                s.walk[0, a, b, l] += unit * s.away[0, a, l] * s.away[0, b, l]
                 s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]
     for a in range(n):
         for b in range(a + 1):
@@ -94,11 +112,11 @@ def wander(s: State, size: float, l: int) -> None:
             for k in range(FIRST_LEARNED, FIRST_ALONE):
                 s.C[a, b, k, l] += s.ratio[k, l] * moved
     for i in range(n):
-        first, own = s.alone[i, l], size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        for a in range(i + 1 if first >= 0 else 0):
+        own = size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range(i + 1 if s.alone[1, i, l] > 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
-                for k in range(first, first + s.rungs[l]):
+                for k in range(s.alone[0, i, l], s.alone[1, i, l]):
                     s.C[a, b, k, l] += s.ratio[k, l] * moved
 
 
@@ -115,8 +133,8 @@ def leap(s: State, more: float, l: int) -> None:
         s.gain[a, k, l] += total
         s.h_k[k, l] += total * s.x[a, l]
     for i in range(n):
-        if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
-            k, own = s.alone[i, l] + s.rungs[l] - 1, more / s.c[i, l]
+        if s.alone[1, i, l] > 0 and s.c[i, l] > 0.0:
+            k, own = s.alone[1, i, l] - 1, more / s.c[i, l]
             for a in range(i + 1):
                 for b in range(a + 1):
                     s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
@@ -310,7 +328,7 @@ def mixture(s: State, l: int) -> None:
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
-    s.rate[l] = s.r[l] * sum_of_row(s, l)
+    s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]

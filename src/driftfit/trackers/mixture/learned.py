@@ -52,6 +52,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    OUTLYING,
     SCORE,
     SHIFT,
     SLOPE,
@@ -63,7 +64,6 @@ from driftfit.trackers.mixture.states import (
     T,
     V,
     note_reading,
-    OUTLYING,
     sum_of_row,
 )
 
@@ -75,10 +75,6 @@ SWEEPS, ROTATIONS = 30, 6
 """Sweeps over the parameters for the diagonal, and over pairs of them for the eigenvectors."""
 ROUNDED = 1e-6
 """Added to the diagonal of M, relative to it."""
-FAR = 9.0
-"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
-STILL = 1e-24
-"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 E, PRECISION, PHI = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
 units of r."""
@@ -99,7 +95,6 @@ def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
-        "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + 2 * n)), "remembered": 0,
         "sums": np.eye(A + 6 * n, 1, -WEIGHT) * np.ones(n), 
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -109,8 +104,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
 
 @kernel
 def learn_means(s: State, l: int) -> None:
-    """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
-    constant = -1
+    """Means and variances of the regressors, over samples at which they move."""
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
         own = s.variance[i, l]
@@ -121,24 +115,6 @@ def learn_means(s: State, l: int) -> None:
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
         most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
-        constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
-    s.constant[l] = constant
-    for i in range(s.parameters[l]):
-        v = s.variance[i, l]
-        far = (s.c[i, l] > (1.0 + FAR) * s.variance[i, l]) & (v > STILL * s.c[i, l])
-        beside = (constant >= 0) & (i != constant) & far
-        s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
-
-
-def centring(fields: Mapping[str, Array], phi: Array) -> Array:
-    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
-    if constant >= 0 and centred.any():
-        mean = phi.mean(axis=0)
-        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
-        A[constant, constant] = 1.0
-    return A
 
 
 @kernel
@@ -368,8 +344,7 @@ def remember(s: State, at: int, l: int) -> None:
         scaled += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
     for i in range(n):
         own = together + scaled * (s.sums[WEIGHT, i, l] + FLOOR + s.sums[DIRECTION, i, l] * s.sums[DIRECTION, i, l])
-        first = s.alone[i, l]
-        for k in range(first, first + s.rungs[l] if first >= 0 else first):
+        for k in range(s.alone[0, i, l], s.alone[1, i, l]):
             own += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
         s.sums[ASSUMED, i, l] = own / BLOCK + (s.sums[ASSUMED, i, l] if s.remembered[l] % BLOCK > 0 else 0.0)
 
@@ -422,9 +397,9 @@ def take_start(s: State, l: int) -> None:
     learn_information(s, s.noise[l], l)
     absorb_on_roots(s, l)
     if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
-        s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])
-        s.count[l] += s.ok[l]
-        s.scale[l] = s.squares[l] / s.count[l]  # NaN until there is a residual
+        sum_before = s.scale[l] * s.count[l] if s.count[l] > 0.0 else 0.0
+        s.count[l] += s.ok[l]  # the scale is NaN until there is a residual
+        s.scale[l] = (sum_before + s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])) / s.count[l]
     keep(s, l)
 
 

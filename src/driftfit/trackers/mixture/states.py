@@ -74,8 +74,8 @@ LEAST_SHARE = 1e-26
 
 def table(n: int, groups: Any) -> dict[str, Array]:
     """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
-    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``first`` (n,), the first
-    mode of the ladder in which a parameter drifts without all others, or -1.
+    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``alone`` (2, n): the
+    first mode of the ladder in which a parameter drifts without all others, and the one after the last.
     """
     each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
     ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
@@ -89,10 +89,10 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
     start[ratio >= 1.0] *= SELDOM
     start[0] = 1.0 - start[1:].sum()
-    first = np.full(n, -1)
+    alone = np.zeros((2, n), int)
     for g, members in enumerate(each):
-        first[list(members)] = np.argmax(of == g)
-    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "first": first}
+        alone[:, list(members)] = np.flatnonzero(of == g)[[0, -1], None] + [[0], [1]]
+    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "alone": alone}
 
 
 def bank(n: int, groups: Any) -> dict[str, Any]:
@@ -102,10 +102,7 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
     return {
         "modes": K,
         "parameters": n,
-        "ratio": modes["ratio"],
-        "arrive": modes["arrive"],
-        "alone": modes["first"],
-        "rungs": len(ALONE if groups is None else GROUP),
+        **{name: modes[name] for name in ("ratio", "arrive", "alone")},
         "mu": modes["start"],
         "m": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
@@ -127,9 +124,8 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
 def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0, "rate": 0.0,
-        "usual_noise": 1.0, "astray": 0.0,
-        "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0,
+        "drift_rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
@@ -224,7 +220,7 @@ def learn_noise(s: State, l: int) -> None:
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("rate", "usual_noise", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "settled", "mean", "variance", "c")
 """Fields that are stored at every sample."""
 
 
@@ -232,9 +228,10 @@ SMOOTHER_FIELDS = ("rate", "usual_noise", "offset", "white", "explained", "settl
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for i in range(s.c.shape[0]):
-        o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
-    o.rate[l], o.usual_noise[l] = s.rate[l], s.usual_noise[l]
-    o.explained[l], o.settled[l], o.constant[l] = s.explained[l], s.settled[l], s.constant[l]
+        o.white[i, l], o.c[i, l] = s.white[i, l], s.c[i, l]
+        o.mean[i, l], o.variance[i, l] = s.mean[i, l], s.variance[i, l]
+    o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
+    o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
 
 
 def drift_ahead(rate: Array) -> Array:
