@@ -5,8 +5,8 @@
     moving   share of the parameters that move within their 95 % bands; ``still``: of those that do not
     output   share of y within the 95 % bands of its prediction
     ahead    the same of forecasts 1 .. 20 samples ahead, from every 50th sample
-    width    median of their standard deviations over that of their errors, which is 1 for normal errors: how much wider
-             bands are than most errors need, however large rare ones are
+    width    median of their standard deviations over the half-width that holds 68 % of their errors: 1 for normal
+             errors, and above 1 for bands wider than most errors need, however large rare ones are
     wrong    share of |theta - truth| > 5 std: certain and wrong
     seconds  time of the run; of several the least
 
@@ -34,7 +34,7 @@ from driftfit import Track, track
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 
-HALF, QUARTILE, CERTAIN = 1.959963984540054, 0.6744897501960817, 5.0
+HALF, CENTRAL, CERTAIN = 1.959963984540054, 0.6826894921370859, 5.0
 HORIZON, EVERY = 20, 50
 """Samples of a forecast, and between forecasts."""
 Scores = dict[str, float]
@@ -125,8 +125,11 @@ def forecast(case: Case, ahead: Callable[[int], tuple[Array, Array]] | None) -> 
     found = [(case.readings[end : end + HORIZON], *ahead(end)) for end in ends] if ahead is not None else []
     y, mean, std = np.array(found or np.full((1, 3, 1), np.nan)).swapaxes(0, 1)
     judged = np.isfinite(y - mean) & np.isfinite(std)
-    size = float(np.median(np.abs(y - mean)[judged])) / QUARTILE if judged.any() else np.nan
-    return {"ahead": within(y - mean, std), "width": float(np.median(std[judged])) / size if size > 0.0 else np.nan}
+    size, wide = (
+        (np.quantile(np.abs(y - mean)[judged], CENTRAL), np.median(std[judged])) if judged.any() else (0.0, 0.0)
+    )
+    least = max(float(size), case.least)
+    return {"ahead": within(y - mean, std), "width": float(wide) / least if least > 0.0 else np.nan}
 
 
 def scored(case: Case, method: Method) -> Scores:
