@@ -3,9 +3,9 @@
 *ratio* is the error of theta over that of an oracle that is given the kind of drift and learns its size in hindsight
 (`benchmarks.held_out.oracle`), *of LABEL* over that of stored results; *step* is the one-step error over the oracle's;
 *moving*, *still* and *output* are shares within 95 % bands, and *ahead* that of forecasts up to 20 samples ahead, whose
-*width* is their std over the half-width that holds 68 % of their errors; *wrong* is the share of |theta - truth| > 5 std in
-per cent. All are means over seeds, seconds are the least. On real records *rms* is the one-step error, and then what
-others have over it, with the difference of their log scores in units of .001; *Kalman* is the best of eight fixed
+*width* is their std over the half-width that holds 68 % of their errors; *wrong* is the share of |theta - truth| > 5
+std in per cent. All are means over seeds, seconds are the least. On real records *rms* is the one-step error, and then
+what others have over it, with the difference of their log scores in units of .001; *Kalman* is the best of eight fixed
 ratios of drift to noise in hindsight.
 
 ``--without`` tells what leaving out a piece costs (`benchmarks.held_out.pieces`): *lines* that would go with it, its

@@ -125,11 +125,8 @@ def forecast(case: Case, ahead: Callable[[int], tuple[Array, Array]] | None) -> 
     found = [(case.readings[end : end + HORIZON], *ahead(end)) for end in ends] if ahead is not None else []
     y, mean, std = np.array(found or np.full((1, 3, 1), np.nan)).swapaxes(0, 1)
     judged = np.isfinite(y - mean) & np.isfinite(std)
-    size, wide = (
-        (np.quantile(np.abs(y - mean)[judged], CENTRAL), np.median(std[judged])) if judged.any() else (0.0, 0.0)
-    )
-    least = max(float(size), case.least)
-    return {"ahead": within(y - mean, std), "width": float(wide) / least if least > 0.0 else np.nan}
+    size = max(float(np.quantile(np.abs(y - mean)[judged], CENTRAL)), case.least) if judged.any() else 0.0
+    return {"ahead": within(y - mean, std), "width": float(np.median(std[judged])) / size if size > 0.0 else np.nan}
 
 
 def scored(case: Case, method: Method) -> Scores:
