@@ -2,14 +2,15 @@
 
 *ratio* is the error of theta over that of an oracle that is given the kind of drift and learns its size in hindsight
 (`benchmarks.held_out.oracle`), *of LABEL* over that of stored results; *step* is the one-step error over the oracle's;
-*moving*, *still* and *output* are shares within 95 % bands; *wrong* is the share of |theta - truth| > 5 std in per
-cent. All are means over seeds, seconds are the least. On real records *rms* is the one-step error, and then what others
-have over it, with the difference of their log scores in units of .001; *Kalman* is the best of eight fixed ratios of
-drift to noise in hindsight.
+*moving*, *still* and *output* are shares within 95 % bands, and *ahead* that of forecasts up to 20 samples ahead, whose
+*width* is their std over the half-width that holds 68 % of their errors; *wrong* is the share of |theta - truth| > 5
+std in per cent. All are means over seeds, seconds are the least. On real records *rms* is the one-step error, and then
+what others have over it, with the difference of their log scores in units of .001; *Kalman* is the best of eight fixed
+ratios of drift to noise in hindsight.
 
 ``--without`` tells what leaving out a piece costs (`benchmarks.held_out.pieces`): *lines* that would go with it, its
-error over that of the whole default (geometric mean, worst, number of scenarios above 1.05), coverage, *wrong*, and the
-one-step errors on real records.
+error over that of the whole default (geometric mean, worst, number of scenarios above 1.05), coverage, width of
+forecasts over that of the whole default (geometric mean), *wrong*, and the one-step errors on real records.
 
 Run: python -m benchmarks.ablation [--seeds 5] [--only NAME ..] [--without PIECE ..|all] [--data PATH] [--quick]
          [--baseline PATH] [--store LABEL] [--against LABEL] [--tracker NAME] [--function LABEL=PATH:NAME]
@@ -36,7 +37,7 @@ from benchmarks.held_out.pieces import PIECES, Without, run_without
 from driftfit import AdaptiveKalman, Bank, Sensor
 from driftfit.trackers.base import Tracker
 
-HEADS = ("ratio", "step", "moving", "still", "output")
+HEADS = ("ratio", "step", "moving", "still", "output", "ahead", "width")
 QUICK, QUICK_PIECE = ("common_walk", "single_walk", "two_jumps"), "single ladders"
 TRACKERS: dict[str, Tracker] = {
     "default": AdaptiveKalman(),
@@ -85,11 +86,21 @@ def summary(label: str, rows: Rows, before: Rows) -> list[str]:
                 f"{geometric(list(values)):.3f}, worst {ratios[worst]:.2f} ({worst}), "
                 f"above 1.15 in {np.sum(values > 1.15)}, above 1.4 in {np.sum(values > 1.4)} of {len(values)}"
             )
-    for head in ("moving", "still", "output"):
+    for head in ("moving", "still", "output", "ahead"):
         shares = {name: row[head] for name, row in rows.items() if np.isfinite(row[head])}
         if shares:
             least = min(shares, key=lambda name: shares[name])
             lines.append(f"{head}: median {np.median(list(shares.values())):.3f}, least {shares[least]:.3f} ({least})")
+    for word, widths in (
+        ("that of most errors", {name: row["width"] for name, row in rows.items()}),
+        (f"that of {label}", {name: rows[name]["width"] / row.get("width", np.nan) for name, row in before.items()}),
+    ):
+        if known := {name: width for name, width in widths.items() if np.isfinite(width)}:
+            widest = max(known, key=lambda name: known[name])
+            lines.append(
+                f"width of forecasts over {word}: median {np.median(list(known.values())):.2f}, "
+                f"most {known[widest]:.2f} ({widest})"
+            )
     wrong = {name: 100.0 * row["wrong"] for name, row in rows.items()}
     most = max(wrong, key=lambda name: wrong[name])
     lines.append(f"certain and wrong: mean {np.mean(list(wrong.values())):.3f} %, most {wrong[most]:.2f} % ({most})")
@@ -159,7 +170,7 @@ class Bench:
         """Print what leaving out each piece costs."""
         whole, whole_records = self.scores("now", of_tracker(AdaptiveKalman()), AdaptiveKalman())
         self.kept.write()
-        heads = ("lines", "mean", "worst", "> 1.05", "moving", "output", "wrong %", "most %", "rms", "worst")
+        heads = ("lines", "mean", "worst", "> 1.05", "moving", "output", "width", "wrong %", "most %", "rms", "worst")
         print(f"{'':26}" + "".join(f"{head:>9}" for head in heads))
         print(self.cost("(nothing)", whole, whole_records, whole, whole_records))
         for piece in pieces:
@@ -182,11 +193,13 @@ class Bench:
         steps = {name: row["rms"] / whole_records[name]["rms"] for name, row in records.items()}
         worst_step = max(steps, key=lambda name: steps[name], default="")
         medians = [np.nanmedian([row[head] for row in rows.values()]) for head in ("moving", "output")]
+        widths = [row["width"] / whole[name]["width"] for name, row in rows.items() if np.isfinite(row["width"])]
         wrong = [100.0 * row["wrong"] for row in rows.values()]
         shown = [
             str(PIECES[piece].lines()) if piece in PIECES else "", f"{geometric(list(ratios.values())):.3f}",
             f"{ratios[worst]:.2f}", str(sum(ratio > 1.05 for ratio in ratios.values())),
-            *(f"{median:.3f}" for median in medians), f"{np.mean(wrong):.3f}", f"{max(wrong):.2f}",
+            *(f"{median:.3f}" for median in medians), f"{geometric(widths):.3f}",
+            f"{np.mean(wrong):.3f}", f"{max(wrong):.2f}",
             f"{geometric(list(steps.values())):.3f}" if steps else "-", f"{steps[worst_step]:.3f}" if steps else "-",
         ]  # fmt: skip
         return f"{piece:26}" + "".join(f"{cell:>9}" for cell in shown) + f"  {worst}, {worst_step}".rstrip(", ")

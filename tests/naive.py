@@ -5,7 +5,7 @@ from scipy import stats
 
 from driftfit.trackers.mixture import filters
 from driftfit.trackers.mixture import states as of_noise
-from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR
+from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, OUTLYING
 
 
 def full(lower):
@@ -18,18 +18,19 @@ def walks(lane, jump=COMMON[-1]):
     """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is the last rung."""
     n, c = len(lane["c"]), lane["c"]
     rho = lane["r"] * np.where(lane["ratio"] == COMMON[-1], jump, lane["ratio"])
-    away = np.eye(n)
-    if lane["offset"].any():
-        away[lane["constant"]] -= lane["offset"]
-    common = (away * lane["drift_unit"]) @ away.T
+    mean, v, away = lane["mean"], lane["variance"], np.eye(n)
+    moving = v > filters.STILL * c
+    constant = np.flatnonzero(~moving & (mean != 0.0))[-1:]
+    centred = moving & (c > (1.0 + filters.FAR) * v) & (len(constant) > 0)
+    away[constant] -= np.where(centred, mean / mean[constant, None], 0.0)
+    common = (away / np.where(centred, v, np.where(c > 0.0, c, np.inf))) @ away.T
     a = np.divide(lane["sums"][of_noise.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
     learned = np.diag(lane["sums"][of_noise.WEIGHT] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
-    for i, first in enumerate(lane["alone"]):
-        if first >= 0:
-            Q[first : first + lane["rungs"], i, i] = inverse[i]
+    for i, (first, end) in enumerate(lane["alone"].T):
+        Q[first:end, i, i] = inverse[i]
     return rho[:, None, None] * Q
 
 
@@ -52,8 +53,8 @@ def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
     jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
-    mean, restless = x @ m @ lane["prior"], states(lane)[1] / (1.0 - lane["outlying"])
-    spread = np.maximum(lane["prior"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
+    mean, restless = x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
+    spread = np.maximum(lane["mu"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
     return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
 
 
@@ -71,7 +72,7 @@ def after_jump(lane, phi, y):
 
 def states(lane):
     """Probabilities (3,) of the states of the noise before a sample."""
-    (quiet, restless, _), o = lane["nu"], lane["outlying"]
+    (quiet, restless, _), o = lane["nu"], lane["nu_prior"][OUTLYING]
     usual = np.array([[of_noise.STAY, 1.0 - of_noise.STAY], [1.0 - of_noise.CALM, of_noise.CALM]])
     return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
 
@@ -80,7 +81,7 @@ def density(lane, phi, y):
     """The predictive density of y, of any shape: Student's while r rests on few samples, and a Cauchy tail."""
     (x, m, C, v), total, count = before(lane, phi), 0.0, float(lane["count"])
     body = stats.norm if count > filters.STUDENT else stats.t(count)
-    for k, weight in enumerate(lane["prior"]):
+    for k, weight in enumerate(lane["mu"]):
         e, h = y - x @ m[:, k], x @ C[k] @ x
         for j, p in enumerate(states(lane)):
             law = stats.cauchy if j == 2 else body
@@ -91,12 +92,12 @@ def density(lane, phi, y):
 
 def sample(lane, phi, y):
     """Probabilities (K,), means (n, K) and covariances (K, n, n) after a sample, before and after the interaction."""
-    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["prior"]), float(lane["count"])
+    (x, m, C, v), K, count = after_jump(lane, phi, y), len(lane["mu"]), float(lane["count"])
     e, g = y - x @ m, C @ x
     h = g @ x
     s = h + np.stack([np.full(K, v[0]), np.full(K, v[1]), np.maximum(v[2], e**2)])
     kernel = np.exp(-0.5 * e**2 / s) if count > filters.STUDENT else (1.0 + e**2 / s / count) ** (-0.5 * (count + 1.0))
-    joint = lane["prior"] * states(lane)[:, None] * kernel / np.sqrt(s)
+    joint = lane["mu"] * states(lane)[:, None] * kernel / np.sqrt(s)
     joint /= joint.sum()
     mu = np.maximum(joint.sum(axis=0), filters.LEAST)
     a, a2 = (joint / s).sum(axis=0) / mu, (joint / s**2).sum(axis=0) / mu

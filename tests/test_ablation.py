@@ -44,7 +44,7 @@ def test_scores_tell_certain_errors_from_honest_ones():
     assert off(0.0, 1.0)["error"] == 0.0
     assert off(0.1, 0.03) | {"seconds": 0.0} == pytest.approx(
         {"error": 0.1 * np.sqrt(np.trace(case.weight())), "step": 0.0, "moving": 0.0, "still": np.nan, "output": 1.0,
-         "wrong": 0.0, "seconds": 0.0}, nan_ok=True,
+         "wrong": 0.0, "seconds": 0.0, "ahead": np.nan, "width": np.nan}, nan_ok=True,
     )  # fmt: skip
     assert off(0.1, 0.01)["wrong"] == 1.0
 

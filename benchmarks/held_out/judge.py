@@ -4,6 +4,9 @@
     step     root mean square of the one-step errors, without codes
     moving   share of the parameters that move within their 95 % bands; ``still``: of those that do not
     output   share of y within the 95 % bands of its prediction
+    ahead    the same of forecasts 1 .. 20 samples ahead, from every 50th sample
+    width    median of their standard deviations over the half-width that holds 68 % of their errors: 1 for normal
+             errors, and above 1 for bands wider than most errors need, however large rare ones are
     wrong    share of |theta - truth| > 5 std: certain and wrong
     seconds  time of the run; of several the least
 
@@ -27,21 +30,27 @@ import numpy as np
 from benchmarks.held_out import changes, plants, records
 from benchmarks.held_out.case import Case
 from benchmarks.held_out.oracle import oracle
-from driftfit import track
+from driftfit import Track, track
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 
-HALF, CERTAIN = 1.959963984540054, 5.0
+HALF, CENTRAL, CERTAIN = 1.959963984540054, 0.6826894921370859, 5.0
+HORIZON, EVERY = 20, 50
+"""Samples of a forecast, and between forecasts."""
 Scores = dict[str, float]
 
 
 class Outcome(NamedTuple):
-    """theta (T, n) and its std after each sample, the prediction (T,) of y and its std before it."""
+    """theta (T, n) and its std after each sample, the prediction (T,) of y and its std before it.
+
+    ``ahead`` forecasts y and its std after so many samples, (`HORIZON`,) each.
+    """
 
     theta: Array
     std: Array
     prediction: Array
     prediction_std: Array
+    ahead: Callable[[int], tuple[Array, Array]] | None = None
 
 
 Method = Callable[[Case], Outcome]
@@ -50,11 +59,19 @@ Method = Callable[[Case], Outcome]
 def of_tracker(tracker: Tracker) -> Method:
     """A tracker of ours on the signals, gated if it asks for that."""
 
-    def run(case: Case) -> Outcome:
+    def until(case: Case, end: int) -> Track:
+        known = {name: value[:end] if np.ndim(value) else value for name, value in case.reading.items()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            out = track(case.model, tracker, case.y, case.u if case.u.size else None, **case.reading)
-        return Outcome(out.theta, out.std, out.prediction, out.innovation_std)
+            return track(case.model, tracker, case.y[:end], case.u[:end] if case.u.size else None, **known)
+
+    def run(case: Case) -> Outcome:
+        def ahead(end: int) -> tuple[Array, Array]:
+            found = until(case, end).forecast(HORIZON, case.u[end : end + HORIZON] if case.u.size else None)
+            return found.y_hat, found.y_std
+
+        out = until(case, len(case.y))
+        return Outcome(out.theta, out.std, out.prediction, out.innovation_std, ahead)
 
     return run
 
@@ -102,6 +119,16 @@ def within(off: Array, std: Array) -> float:
     return float(np.mean(np.abs(off[judged]) <= HALF * std[judged])) if judged.any() else np.nan
 
 
+def forecast(case: Case, ahead: Callable[[int], tuple[Array, Array]] | None) -> Scores:
+    """The scores of forecasts."""
+    ends = range(case.burn, len(case.y) - HORIZON, EVERY) if ahead is not None else ()
+    found = [(case.readings[end : end + HORIZON], *ahead(end)) for end in ends] if ahead is not None else []
+    y, mean, std = np.array(found or np.full((1, 3, 1), np.nan)).swapaxes(0, 1)
+    judged = np.isfinite(y - mean) & np.isfinite(std)
+    size = max(float(np.quantile(np.abs(y - mean)[judged], CENTRAL)), case.least) if judged.any() else 0.0
+    return {"ahead": within(y - mean, std), "width": float(np.median(std[judged])) / size if size > 0.0 else np.nan}
+
+
 def scored(case: Case, method: Method) -> Scores:
     """The scores of a method on a case."""
     begun = perf_counter()
@@ -121,6 +148,7 @@ def scored(case: Case, method: Method) -> Scores:
         "output": within(y, out.prediction_std[late]),
         "wrong": float(np.mean((np.abs(off) > CERTAIN * std)[judged] & matters[judged])) if judged.any() else 0.0,
         "seconds": seconds,
+        **forecast(case, out.ahead),
     }
 
 

@@ -61,7 +61,7 @@ def never(state: dict[str, Any], out: Array) -> None:
     arrive[jump] *= before / arrive[jump].sum() if (jump & ~out).any() else 1.0
     start = np.where(out, NEXT_TO_NEVER, state["mu"])
     state["arrive"] = arrive
-    state["mu"] = state["prior"] = start / start.sum()
+    state["mu"] = start / start.sum()
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,6 @@ PIECES: dict[str, Piece] = {
             "turn",
             "machine_drift",
             "remember",
-            "end_block",
             "learn_drift",
         ),
     ),
@@ -123,7 +122,7 @@ PIECES: dict[str, Piece] = {
     ),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
-        edits=((LEARNED, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")
+        edits=((BANK, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")
     ),
     "coloured noise": Piece(
         edits=((LEARNED, "s.colour[l] = max(-MOST, min(MOST, known))", "s.colour[l] = 0.0 * known"),),

@@ -172,7 +172,7 @@ def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: 
     for i in range(na - 1, 0, -1):
         s.doubt[o, i, l], s.suspect[o, i, l] = s.doubt[o, i - 1, l], s.suspect[o, i - 1, l]
         s.aside[o, i, l], s.blur[o, i, l] = s.aside[o, i - 1, l], s.blur[o, i - 1, l]
-    outlier, observed, known = s.outlier[own], s.observed[own] > 0.0, s.s[own] < np.inf
+    outlier, observed, known = s.nu[2, own], s.observed[own] > 0.0, s.s[own] < np.inf
     doubt = s.false_share[o, l] * outlier
     some = observed & known & (doubt > SMALLEST_DOUBT)
     s.suspect[o, 0, l] = outlier if some else 0.0

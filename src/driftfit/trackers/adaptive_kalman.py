@@ -49,14 +49,12 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
     FRAME,
     frame,
-    located,
     located_within,
     unseen_variance,
-    whiten,
     whiten_within,
 )
 from driftfit.trackers.forms.covariance import prediction
-from driftfit.trackers.forms.diffuse import knowing_nothing, spanned_variance
+from driftfit.trackers.forms.diffuse import ENTERING, knowing_nothing, spanned_variance
 from driftfit.trackers.forms.excitation import (
     FIRST,
     learn_information,
@@ -67,10 +65,18 @@ from driftfit.trackers.forms.excitation import (
     window,
 )
 from driftfit.trackers.forms.information import partly_known
-from driftfit.trackers.mixture.filters import enter_filters, innovate, mix, mixture, predict, update_filters, weigh
+from driftfit.trackers.mixture.filters import (
+    centring,
+    enter_filters,
+    innovate,
+    mix,
+    mixture,
+    predict,
+    update_filters,
+    weigh,
+)
 from driftfit.trackers.mixture.learned import (
     begin_with_drift,
-    centring,
     colour,
     forecast_start,
     learn_colour,
@@ -84,6 +90,7 @@ from driftfit.trackers.mixture.learned import (
 )
 from driftfit.trackers.mixture.states import (
     MOST_ALONE,
+    OUTLYING,
     SMOOTHER_FIELDS,
     any_noise,
     bank,
@@ -96,22 +103,6 @@ from driftfit.trackers.mixture.states import (
     store_for_smoother,
 )
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
-
-
-@kernel
-def interact(s: State, l: int) -> None:
-    if s.ok[l] > 0.0:
-        # now, not before the next sample: its prediction may not depend on whether its output will be there
-        mix(s, l)
-
-
-@kernel
-def go_on(s: State, l: int) -> None:
-    """The estimate of the mixture, and the interaction of the filters, while columns may be free."""
-    if s.ok[l] > 0.0:
-        located_within(s, l)
-    interact(s, l)
-    unseen_variance(s, l)
 
 
 @partial(kernel, short=True)
@@ -127,17 +118,16 @@ def settle(s: State, l: int) -> None:
     frame(s, l)
     begin_with_drift(s, least_noise(s, l), l)
     s.usual_noise[l] = s.r[l]
-    mixture(s, l)
-    go_on(s, l)
 
 
 @partial(kernel, inline=False)
-def look_ahead(s: State, entering: int, l: int) -> None:
-    """Prediction of the running filters, and its variance; ``entering`` is the column in a new direction, or -1."""
-    s.column[l] = entering
+def look_ahead(s: State, l: int) -> None:
+    """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
+    whiten_noise(s, l)
+    column = whiten_within(s, s.white.ctypes.data, l)
     noise_prior(s, l)
     innovate(s, l)
-    if entering >= 0:
+    if column >= 0:
         s.y_hat[l] = prediction(s, l)
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
 
@@ -145,9 +135,9 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 @partial(kernel, inline=False)
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
-    s.outlier[l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
+    s.nu[OUTLYING, l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
     note_reading(s, l)
-    column = s.column[l]
+    column = int(s.at_start[ENTERING, l])
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
     elif s.ok[l] > 0.0:
@@ -156,9 +146,6 @@ def follow(s: State, l: int) -> None:
         update_filters(s, l)
         learn_drift(s, l)
         learn_noise(s, l)
-    else:
-        for k in range(s.modes[l]):
-            s.mu[k, l] = s.prior[k, l]
     learn_colour(s, weighed, l)
     learn_scales(s, l)
     learn_means(s, l)
@@ -167,58 +154,44 @@ def follow(s: State, l: int) -> None:
 
 @kernel
 def forecast(s: State, l: int) -> None:
-    whiten_noise(s, l)
-    whiten(s, l)
-    look_ahead(s, -1, l)
-
-
-@kernel
-def correct(s: State, l: int) -> None:
-    follow(s, l)
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    mixture(s, l)
-    if s.ok[l] > 0.0:
-        located(s, l)
-    interact(s, l)
-
-
-@kernel
-def forecast_first(s: State, l: int) -> None:
-    """That of least squares until the filters start; afterwards of the running filters, while there are directions
-    without information.
-    """
+    """Of the filters, and of least squares until they start."""
     if s.settled[l] > 0:
-        whiten_noise(s, l)
-        look_ahead(s, whiten_within(s, s.white.ctypes.data, l), l)
+        look_ahead(s, l)
     else:
         forecast_start(s, l)
         s.s[l] *= wider(s.count[l])
 
 
 @kernel
-def correct_first(s: State, l: int) -> None:
+def correct(s: State, l: int) -> None:
     if s.settled[l] > 0:
         follow(s, l)
-        mixture(s, l)
-        go_on(s, l)
+        return
+    residuals = s.count[l]
+    take_start(s, l)
+    if s.h[l] < np.inf:
+        s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
+    n = s.parameters[l]
+    rank = s.rank[l] - (s.theta.shape[0] - n)  # without the parameters that are known
+    # a column that enters late, as of signals that a model has to compute first, has no residuals yet
+    early = rank == n and s.remembered[l] <= n + RESIDUALS
+    enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
+    spanned_variance(s, l)
+    if enough and s.remembered[l] - rank >= RESIDUALS:
+        settle(s, l)
     else:
-        residuals = s.count[l]
-        take_start(s, l)
-        if s.h[l] < np.inf:
-            s.density[l] = start_density(s.e[l], s.s[l] / wider(residuals), residuals)
-        n = s.parameters[l]
-        rank = s.rank[l] - (s.theta.shape[0] - n)  # without the parameters that are known
-        # a column that enters late, as of signals that a model has to compute first, has no residuals yet
-        early = rank == n and s.remembered[l] <= n + RESIDUALS
-        enough = s.count[l] >= RESIDUALS and (early or s.remembered[l] >= FIRST)
-        spanned_variance(s, l)
-        if enough and s.remembered[l] - rank >= RESIDUALS:
-            settle(s, l)
-        else:
-            widen_estimates(s, l)
+        widen_estimates(s, l)
+
+
+@kernel
+def report(s: State, l: int) -> None:
+    if s.settled[l] > 0:
+        mixture(s, l)
+        if s.ok[l] > 0.0:
+            located_within(s, l)
+            # now, not before the next sample: its prediction may not depend on whether its output will be there
+            mix(s, l)
+        unseen_variance(s, l)
 
 
 @kernel
@@ -251,8 +224,8 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "at_start", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away", "W", "nu_prior",
+        "pivot", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
+        "away", "W",
     )  # fmt: skip
     """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 
@@ -278,11 +251,8 @@ class AdaptiveKalman(Tracker):
             "density": np.nan,
             "r": 1.0,
             "scale": np.nan,
-            "squares": 0.0,
             "count": 0.0,
-            "waited": 0.0,
             "settled": 0,
-            "column": -1,
             "shift": 0.0,
             "vague": 0.0,
             **knowing_nothing(n),
@@ -303,7 +273,6 @@ class AdaptiveKalman(Tracker):
             correct,
             report,
             nothing,
-            TrackerSteps(predict, forecast_first, correct_first, nothing, nothing),
             store=keep_density,
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_drift),
@@ -320,8 +289,8 @@ class AdaptiveKalman(Tracker):
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
         running = fields["settled"] > 0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
-        rate = fields["r"] * drift_ahead(self.state(n)["ratio"], fields["mu"])
-        return centring(fields, phi), noise, np.where(running, rate, 0.0), groups
+        rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
+        return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

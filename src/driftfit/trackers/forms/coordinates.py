@@ -96,16 +96,6 @@ FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
 
 
 @kernel
-def whiten(s: State, l: int) -> None:
-    """x = M^-T phi, if no column is free."""
-    for j in range(s.theta.shape[0]):
-        u = s.white[j, l]
-        for i in range(j):
-            u -= s.S[i, j, l] * s.x[i, l]
-        s.x[j, l] = u / s.S[j, j, l]
-
-
-@kernel
 def whiten_within(s: State, phi: int, l: int) -> int:
     """x of the regressor at address ``phi`` if columns are free; returns the column along which it leaves the span of
     earlier regressors, or -1."""
@@ -148,17 +138,6 @@ def new_row(s: State, phi: Array, j: int, l: int) -> float:
         s.volume[l] = s.at_start[VOLUME, l]
         s.root[l] = 1 if s.rank[l] < n else 0
     return sign
-
-
-@kernel
-def located(s: State, l: int) -> None:
-    """theta = M^-1 d, if no column is free."""
-    n = s.theta.shape[0]
-    for i in range(n - 1, -1, -1):
-        t = s.d[i, l]
-        for j in range(i + 1, n):
-            t -= s.S[i, j, l] * s.theta[j, l]
-        s.theta[i, l] = t / s.S[i, i, l]
 
 
 @kernel

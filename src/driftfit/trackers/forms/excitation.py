@@ -51,7 +51,7 @@ DOUBT = 0.05
 
 def window(n: int) -> int:
     """Number of samples in the window of G."""
-    return max(50, 10 * n)
+    return max(int(MEMORY), 10 * n)
 
 
 def no_excitation(n: int) -> dict[str, Any]:
@@ -62,7 +62,6 @@ def no_excitation(n: int) -> dict[str, Any]:
         "c": np.zeros(n),
         "active": np.zeros(n),
         "information": np.zeros((n, n)),
-        "fade": 1.0 - 1.0 / window(n),
     }
 
 
@@ -96,12 +95,13 @@ def learn_information(s: State, noise: float, l: int) -> None:
     ``noise``: those that the guard against constant inputs examines.
     """
     n = s.theta.shape[0]
+    fade = 1.0 - 1.0 / max(MEMORY, 10.0 * s.parameters[l])
     for i in range(n):
         for j in range(i + 1):
             unit = s.c[i, l] * s.c[j, l]
             fresh = s.phi[i, l] * s.phi[j, l] / np.sqrt(unit) if unit > 0.0 else 0.0
             fresh *= s.ok[l] / noise
-            s.information[i, j, l] = s.fade[l] * s.information[i, j, l] + fresh
+            s.information[i, j, l] = fade * s.information[i, j, l] + fresh
 
 
 def learned(lane: Mapping[str, Array]) -> Array:

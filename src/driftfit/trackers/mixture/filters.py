@@ -22,11 +22,12 @@ O(K n^2) for K modes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
 
-from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
@@ -39,12 +40,17 @@ from driftfit.trackers.mixture.states import (
     FIRST_LEARNED,
     FLOOR,
     JUMP,
+    OUTLYING,
     STATES,
     WEIGHT,
     sum_of_row,
     variance_in,
 )
 
+FAR = 9.0
+"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
+STILL = 1e-24
+"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
@@ -56,23 +62,36 @@ LEAST = 1e-100
 """Probability that a mode is never below."""
 
 
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
+    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
+    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
+    for k in np.flatnonzero(constant[-1])[-1:]:
+        mean = phi.mean(axis=0)
+        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
+    return A
+
+
 @partial(kernel, inline=False)
 def walks(s: State, l: int) -> None:
     """The common drift and the learned one in the coordinates z, for a ratio of 1 and r = 1."""
-    n, k = s.parameters[l], s.constant[l]
+    n, k = s.parameters[l], -1
     for a in range(n):
+        k = a if (s.variance[a, l] <= STILL * s.c[a, l]) & (s.mean[a, l] != 0.0) else k
         s.away[1, a, l] = 0.0
         for b in range(a + 1):
             s.walk[0, a, b, l], s.walk[1, a, b, l] = 0.0, 0.0
     for i in range(n):
         root = 1.0 / np.sqrt(s.c[i, l]) if s.c[i, l] > 0.0 else 0.0
-        own = s.sums[WEIGHT, i, l] * root * root
-        rows = i + 1 if s.offset[i, l] == 0.0 else max(i, k) + 1  # S is triangular
-        for a in range(rows):
-            s.away[0, a, l] = s.S[a, i, l] - (s.offset[i, l] * s.S[a, k, l] if s.offset[i, l] != 0.0 else 0.0)
+        own, v = s.sums[WEIGHT, i, l] * root * root, s.variance[i, l]
+        beside = (k >= 0) & (i != k) & (s.c[i, l] > (1.0 + FAR) * v) & (v > STILL * s.c[i, l])
+        unit = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range((max(i, k) if beside else i) + 1):  # S is triangular
+            s.away[0, a, l] = s.S[a, i, l] - (s.mean[i, l] / s.mean[k, l] * s.S[a, k, l] if beside else 0.0)
             s.away[1, a, l] += s.S[a, i, l] * s.sums[DIRECTION, i, l] * root
             for b in range(a + 1):
-                s.walk[0, a, b, l] += s.drift_unit[i, l] * s.away[0, a, l] * s.away[0, b, l]
+                s.walk[0, a, b, l] += unit * s.away[0, a, l] * s.away[0, b, l]
                 s.walk[1, a, b, l] += own * s.S[a, i, l] * s.S[b, i, l]
     for a in range(n):
         for b in range(a + 1):
@@ -93,11 +112,11 @@ def wander(s: State, size: float, l: int) -> None:
             for k in range(FIRST_LEARNED, FIRST_ALONE):
                 s.C[a, b, k, l] += s.ratio[k, l] * moved
     for i in range(n):
-        first, own = s.alone[i, l], size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        for a in range(i + 1 if first >= 0 else 0):
+        own = size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for a in range(i + 1 if s.alone[1, i, l] > 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
-                for k in range(first, first + s.rungs[l]):
+                for k in range(s.alone[0, i, l], s.alone[1, i, l]):
                     s.C[a, b, k, l] += s.ratio[k, l] * moved
 
 
@@ -114,8 +133,8 @@ def leap(s: State, more: float, l: int) -> None:
         s.gain[a, k, l] += total
         s.h_k[k, l] += total * s.x[a, l]
     for i in range(n):
-        if s.alone[i, l] >= 0 and s.c[i, l] > 0.0:
-            k, own = s.alone[i, l] + s.rungs[l] - 1, more / s.c[i, l]
+        if s.alone[1, i, l] > 0 and s.c[i, l] > 0.0:
+            k, own = s.alone[1, i, l] - 1, more / s.c[i, l]
             for a in range(i + 1):
                 for b in range(a + 1):
                     s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
@@ -170,13 +189,13 @@ def innovate(s: State, l: int) -> None:
     project(s, l)
     for k in range(K):
         s.e_k[k, l] += s.explained[l]
-        s.row[k, l] = s.prior[k, l] * s.e_k[k, l]
+        s.row[k, l] = s.mu[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
     for k in range(K):  # the band is for samples at which no jump begins
-        p = s.prior[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
+        p = s.mu[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
         s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
     v = sum_of_row(s, l) + s.vague[l]
-    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.outlying[l])
+    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
     v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
@@ -194,23 +213,23 @@ def likelihoods(s: State, more: float, l: int) -> None:
     few = s.count[l]
     for j in range(STATES):
         noise = variance_in(s, j, l) + more
-        widest = np.inf if j == STATES - 1 else 0.0
+        widest = np.inf if j == OUTLYING else 0.0
         for k in range(s.modes[l]):
             square = s.e_k[k, l] * s.e_k[k, l]
             v = 1.0 / (s.h_k[k, l] + max(noise, min(square, widest)))
             far = square * v if few > STUDENT else (few + 1.0) * log(1.0 + square * v / few)
             s.inverse[j, k, l] = v
-            s.joint[j, k, l] = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
+            s.joint[j, k, l] = s.mu[k, l] * s.nu_prior[j, l] * np.sqrt(v) * exp(-0.5 * far)
 
 
 @partial(kernel, inline=False)
 def predictive_density(s: State, l: int) -> None:
     """The log density of the sample under its prediction, with a Cauchy tail for outliers, which integrates to 1."""
     K, few = s.modes[l], s.count[l]
-    noise = variance_in(s, STATES - 1, l) + s.vague[l]
+    noise = variance_in(s, OUTLYING, l) + s.vague[l]
     for k in range(K):
         v = s.h_k[k, l] + noise
-        s.row[k, l] = s.prior[k, l] * s.nu_prior[STATES - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+        s.row[k, l] = s.mu[k, l] * s.nu_prior[OUTLYING, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
     tail = log(sum_of_row(s, l) / np.pi)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l]
@@ -247,11 +266,10 @@ def weigh(s: State, more: float, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
-    s.outlier[l] = s.nu[STATES - 1, l]
-    s.astray[l] = s.outlier[l] * square
+    s.astray[l] = s.nu[OUTLYING, l] * square
     # an outlier says nothing about the state of ordinary noise
-    for j in range(STATES - 1):
-        s.nu[j, l] += s.nu[STATES - 1, l] * s.nu_prior[j, l] / (1.0 - s.outlying[l])
+    for j in range(OUTLYING):
+        s.nu[j, l] += s.nu[OUTLYING, l] * s.nu_prior[j, l] / (1.0 - s.nu_prior[OUTLYING, l])
 
 
 @partial(kernel, inline=False)
@@ -280,8 +298,6 @@ def update_filters(s: State, l: int) -> None:
         spread = max(part * (p * u * u + q * v * v + o * w * w) - a * a, 0.0)
         s.step[k, l] = a * s.e_k[k, l]
         s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
-        s.row[k, l] = s.mu[k, l] * a
-    s.precision[l] = sum_of_row(s, l)
     absorb(s, l)
     for j in range(s.trend.shape[1]):
         k = len(COMMON) + j
@@ -299,7 +315,6 @@ def enter_filters(s: State, j: int, l: int) -> None:
     for t in range(s.trend.shape[1]):
         s.trend[j, t, l] = 0.0
     for k in range(K):
-        s.mu[k, l] = s.prior[k, l]
         for i in range(n):
             s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]
         s.m[j, k, l] = sign * s.e_k[k, l]
@@ -311,6 +326,9 @@ def enter_filters(s: State, j: int, l: int) -> None:
 def mixture(s: State, l: int) -> None:
     """Mean d of the filters, and the covariance of theta that is reported; without a sample d keeps its bits."""
     n, K = s.parameters[l], s.modes[l]
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
+    s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
@@ -344,8 +362,8 @@ def mix(s: State, l: int) -> None:
     for k in range(K):
         above = s.row[k + 1, l] if s.ratio[min(k + 1, K - 1), l] > s.ratio[k, l] else 0.0
         stays = (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
-        s.prior[k, l] = stays + above + s.arrive[k, l]
-        s.step[k, l], s.curve[k, l] = stays / s.prior[k, l], above / s.prior[k, l]
+        s.mu[k, l] = stays + above + s.arrive[k, l]
+        s.step[k, l], s.curve[k, l] = stays / s.mu[k, l], above / s.mu[k, l]
     s.row[K, l] = 0.0
     for a in range(n):
         for k in range(K):

@@ -52,6 +52,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    OUTLYING,
     SCORE,
     SHIFT,
     SLOPE,
@@ -74,10 +75,6 @@ SWEEPS, ROTATIONS = 30, 6
 """Sweeps over the parameters for the diagonal, and over pairs of them for the eigenvectors."""
 ROUNDED = 1e-6
 """Added to the diagonal of M, relative to it."""
-FAR = 9.0
-"""Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
-STILL = 1e-24
-"""Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
 E, PRECISION, PHI = range(3)
 """Entries of a stored sample before its regressor: the innovation over its variance, and the inverse variance, both in
 units of r."""
@@ -98,8 +95,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
-        "constant": -1, "drift_unit": np.zeros(n), "offset": np.zeros(n),
-        "samples": np.zeros((WINDOW, PHI + n)), "gains": np.zeros((WINDOW, n)), "remembered": 0,
+        "samples": np.zeros((WINDOW, PHI + 2 * n)), "remembered": 0,
         "sums": np.eye(A + 6 * n, 1, -WEIGHT) * np.ones(n), 
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
         "colour_scores": np.zeros(3),
@@ -108,8 +104,7 @@ def nothing_learned(n: int) -> dict[str, Any]:
 
 @kernel
 def learn_means(s: State, l: int) -> None:
-    """Means and variances of the regressors, and the drift of each: 1 / v_i and m_i / m_k, or 1 / c_i and 0."""
-    constant = -1
+    """Means and variances of the regressors, over samples at which they move."""
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
         own = s.variance[i, l]
@@ -120,24 +115,6 @@ def learn_means(s: State, l: int) -> None:
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
         most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
-        constant = i if (s.variance[i, l] <= STILL * s.c[i, l]) & (s.mean[i, l] != 0.0) else constant
-    s.constant[l] = constant
-    for i in range(s.parameters[l]):
-        v = s.variance[i, l]
-        far = (s.c[i, l] > (1.0 + FAR) * s.variance[i, l]) & (v > STILL * s.c[i, l])
-        beside = (constant >= 0) & (i != constant) & far
-        s.drift_unit[i, l] = 1.0 / v if beside else 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        s.offset[i, l] = s.mean[i, l] / s.mean[constant, l] if beside else 0.0
-
-
-def centring(fields: Mapping[str, Array], phi: Array) -> Array:
-    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    centred, A, constant = fields["offset"] != 0.0, np.eye(phi.shape[1]), int(fields["constant"][-1])
-    if constant >= 0 and centred.any():
-        mean = phi.mean(axis=0)
-        A[constant] = np.where(centred.any(axis=0), -mean / mean[constant], 0.0)
-        A[constant, constant] = 1.0
-    return A
 
 
 @kernel
@@ -153,7 +130,7 @@ def whiten_noise(s: State, l: int) -> None:
 def learn_colour(s: State, weighed: float, l: int) -> None:
     """Update c, and store the past of the next sample; s.theta is still the prediction. An outlier is no past."""
     c, v = s.colour[l] if s.dt[l] <= GAP else 0.0, s.past_y[l]
-    ordinary = weighed * (1.0 - s.outlier[l])
+    ordinary = weighed * (1.0 - s.nu[OUTLYING, l])
     for i in range(s.theta.shape[0]):
         v -= s.past[i, l] * s.theta[i, l]
         s.past[i, l] = ordinary * s.white[i, l]
@@ -180,18 +157,18 @@ def colour(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
 
 
 @shared
-def step_back(past: Array, gains: Array, at: int, t: Array) -> None:
+def step_back(past: Array, at: int, t: Array) -> None:
     """One backward step of u and N."""
     n = t.shape[1]
     move, more = past[at, E], past[at, PRECISION]
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += t[N + 6 * i, j] * gains[at, j]
+            total += t[N + 6 * i, j] * past[at, PHI + n + j]
         t[SHIFT, i] = total
     for i in range(n):
-        move -= gains[at, i] * t[SCORE, i]
-        more += gains[at, i] * t[SHIFT, i]
+        move -= past[at, PHI + n + i] * t[SCORE, i]
+        more += past[at, PHI + n + i] * t[SHIFT, i]
     for i in range(n):
         x = past[at, PHI + i]
         t[SCORE, i] += x * move
@@ -202,7 +179,7 @@ def step_back(past: Array, gains: Array, at: int, t: Array) -> None:
 
 
 @shared
-def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
+def look_back(past: Array, newest: int, t: Array) -> None:
     """Add the sums of the older half of the window."""
     n = t.shape[1]
     for i in range(n):
@@ -214,7 +191,7 @@ def look_back(past: Array, gains: Array, newest: int, t: Array) -> None:
             t[M + 6 * i, j] *= FADE
             t[N + 6 * i, j], t[T + 6 * i, j] = 0.0, 0.0
     for back in range(WINDOW):
-        step_back(past, gains, (newest + WINDOW - back) % WINDOW, t)
+        step_back(past, (newest + WINDOW - back) % WINDOW, t)
         if back >= WINDOW - BLOCK:
             for i in range(n):
                 t[SLOPE, i] += t[SCORE, i] * t[SCORE, i] - t[N + 6 * i, i]
@@ -329,10 +306,10 @@ def turn(t: Array) -> None:
 
 
 @partial(machine, short=True)
-def machine_drift(past: int, gains: int, newest: int, sums: int, n: int, L: int, l: int) -> None:
+def machine_drift(past: int, newest: int, sums: int, n: int, L: int, l: int) -> None:
     """A pass for lane l of L, from the addresses of fields."""
     t = cubes(sums, A + 6 * n, n, L)[:, :, l]
-    look_back(cubes(past, WINDOW, PHI + n, L)[:, :, l], cubes(gains, WINDOW, n, L)[:, :, l], newest, t)
+    look_back(cubes(past, WINDOW, PHI + 2 * n, L)[:, :, l], newest, t)
     diagonal(t)
     whitened(t)
     turn(t)
@@ -343,21 +320,22 @@ def remember(s: State, at: int, l: int) -> None:
     """Store a sample that the filters used, in units of r and c."""
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
-        s.row[k, l] = s.mu[k, l] * s.step[k, l]
-    e = sum_of_row(s, l)
+        a = s.joint[0, k, l] * s.inverse[0, k, l] + s.joint[1, k, l] * s.inverse[1, k, l]
+        s.curve[k, l] = s.row[k, l] = a + s.joint[2, k, l] * s.inverse[2, k, l]
+    s.samples[at, PRECISION, l] = sum_of_row(s, l) * s.r[l]
+    for k in range(K):
+        s.row[k, l] = s.curve[k, l] * s.e_k[k, l]
+    s.samples[at, E, l] = sum_of_row(s, l) * np.sqrt(s.r[l])
     for i in range(n):
         for k in range(K):
-            a = s.joint[0, k, l] * s.inverse[0, k, l] + s.joint[1, k, l] * s.inverse[1, k, l]
-            s.row[k, l] = s.gain[i, k, l] * (a + s.joint[2, k, l] * s.inverse[2, k, l])
+            s.row[k, l] = s.curve[k, l] * s.gain[i, k, l]
         s.away[0, i, l] = sum_of_row(s, l)
     for i in range(n):
         gain, unit = 0.0, np.sqrt(s.c[i, l])
         for j in range(i, n):
             gain += s.R[i, j, l] * s.away[0, j, l]
         s.samples[at, PHI + i, l] = s.white[i, l] / unit if unit > 0.0 else 0.0
-        s.gains[at, i, l] = gain * unit
-    s.samples[at, E, l] = e * np.sqrt(s.r[l])
-    s.samples[at, PRECISION, l] = s.precision[l] * s.r[l]
+        s.samples[at, PHI + s.theta.shape[0] + i, l] = gain * unit
     together = 0.0
     for k in range(FIRST_LEARNED):
         together += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
@@ -366,8 +344,7 @@ def remember(s: State, at: int, l: int) -> None:
         scaled += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
     for i in range(n):
         own = together + scaled * (s.sums[WEIGHT, i, l] + FLOOR + s.sums[DIRECTION, i, l] * s.sums[DIRECTION, i, l])
-        first = s.alone[i, l]
-        for k in range(first, first + s.rungs[l] if first >= 0 else first):
+        for k in range(s.alone[0, i, l], s.alone[1, i, l]):
             own += s.mu[k, l] * s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0
         s.sums[ASSUMED, i, l] = own / BLOCK + (s.sums[ASSUMED, i, l] if s.remembered[l] % BLOCK > 0 else 0.0)
 
@@ -380,7 +357,7 @@ def learn_drift(s: State, l: int) -> None:
     s.remembered[l] += 1
     if s.remembered[l] % BLOCK == 0 and s.remembered[l] >= WINDOW:
         n, L = s.d.shape
-        machine_drift(s.samples.ctypes.data, s.gains.ctypes.data, at, s.sums.ctypes.data, n, L, l)
+        machine_drift(s.samples.ctypes.data, at, s.sums.ctypes.data, n, L, l)
 
 
 @kernel
@@ -398,9 +375,8 @@ def keep(s: State, l: int) -> None:
             at, root = s.remembered[l], 1.0 / math.sqrt(s.noise[l])
             for i in range(s.theta.shape[0]):
                 s.samples[at, PHI + i, l] = root * s.phi[i, l]
-            s.samples[at, Y, l], s.samples[at, SINCE, l] = root * s.y[l], s.waited[l]
+            s.samples[at, Y, l] = root * s.y[l]
         s.remembered[l] += 1
-        s.waited[l] = 0.0
 
 
 @kernel
@@ -413,16 +389,17 @@ def forecast_start(s: State, l: int) -> None:
 @partial(kernel, short=True)
 def take_start(s: State, l: int) -> None:
     """A sample of least squares, and its residual if the reading did not repeat the one before."""
-    s.waited[l] += s.dt[l] * s.drift[l]
+    if s.remembered[l] < WINDOW:
+        s.samples[s.remembered[l], SINCE, l] += s.dt[l] * s.drift[l]
     note_reading(s, l)
     learn_scales(s, l)
     learn_means(s, l)
     learn_information(s, s.noise[l], l)
     absorb_on_roots(s, l)
     if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
-        s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])
-        s.count[l] += s.ok[l]
-        s.scale[l] = s.squares[l] / s.count[l]  # NaN until there is a residual
+        sum_before = s.scale[l] * s.count[l] if s.count[l] > 0.0 else 0.0
+        s.count[l] += s.ok[l]  # the scale is NaN until there is a residual
+        s.scale[l] = (sum_before + s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])) / s.count[l]
     keep(s, l)
 
 
@@ -438,10 +415,10 @@ def start_regressor(s: State, at: int, l: int) -> None:
 
 @kernel
 def run_again(s: State, l: int) -> None:
-    """Every filter over the stored samples, in units of r; sums of squares in ``mu``, of logs in ``prior``."""
+    """Every filter over the stored samples, in units of r; sums of squares and of logs in ``joint``."""
     n, K = s.theta.shape[0], s.modes[l]
     for k in range(K):
-        s.mu[k, l], s.prior[k, l] = 0.0, 0.0
+        s.joint[0, k, l], s.joint[1, k, l] = 0.0, 0.0
     for i in range(n):
         for k in range(K):
             s.C[i, i, k, l] *= LOOSE
@@ -452,8 +429,8 @@ def run_again(s: State, l: int) -> None:
         project(s, l)
         for k in range(K):
             e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + 1.0
-            s.mu[k, l] += e * e / v
-            s.prior[k, l] += log(v)
+            s.joint[0, k, l] += e * e / v
+            s.joint[1, k, l] += log(v)
             s.step[k, l], s.curve[k, l] = e / v, 1.0 / v
         absorb(s, l)
 
@@ -463,16 +440,14 @@ def begin_with_drift(s: State, least: float, l: int) -> None:
     """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
     n, K, count, nearest = s.theta.shape[0], s.modes[l], s.count[l], np.inf
     if s.remembered[l] <= WINDOW:
-        for k in range(K):
-            s.inverse[0, k, l] = s.mu[k, l]
         run_again(s, l)
         for k in range(K):
             # residuals below the floor of r are rounding, and say nothing about the drift
-            s.step[k, l] = max(s.mu[k, l] / count, least)
-            s.curve[k, l] = s.prior[k, l] + count * log(s.step[k, l])
+            s.step[k, l] = max(s.joint[0, k, l] / count, least)
+            s.curve[k, l] = s.joint[1, k, l] + count * log(s.step[k, l])
             nearest = min(nearest, s.curve[k, l])
         for k in range(K):
-            s.row[k, l] = s.inverse[0, k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
+            s.row[k, l] = s.mu[k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
         share = 1.0 / sum_of_row(s, l)
         for k in range(K):
             s.mu[k, l] = s.row[k, l] * share

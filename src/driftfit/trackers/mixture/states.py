@@ -56,7 +56,8 @@ FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
 ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
 """Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
 B, of M, of N and of two scratch matrices by turns."""
-STATES = 3
+OUTLYING, STATES = 2, 3
+"""The last state of the noise, and their number."""
 OUTLIER, RARITY, OFTEN = 0.035, 50.0, 1000.0
 """Probability of an outlier before the first sample, samples that this counts for, and memory of those since."""
 STAY, CALM = 0.995, 0.98
@@ -73,8 +74,8 @@ LEAST_SHARE = 1e-26
 
 def table(n: int, groups: Any) -> dict[str, Array]:
     """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
-    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``first`` (n,), the first
-    mode of the ladder in which a parameter drifts without all others, or -1.
+    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``alone`` (2, n): the
+    first mode of the ladder in which a parameter drifts without all others, and the one after the last.
     """
     each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
     ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
@@ -88,10 +89,10 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
     start[ratio >= 1.0] *= SELDOM
     start[0] = 1.0 - start[1:].sum()
-    first = np.full(n, -1)
+    alone = np.zeros((2, n), int)
     for g, members in enumerate(each):
-        first[list(members)] = np.argmax(of == g)
-    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "first": first}
+        alone[:, list(members)] = np.flatnonzero(of == g)[[0, -1], None] + [[0], [1]]
+    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "alone": alone}
 
 
 def bank(n: int, groups: Any) -> dict[str, Any]:
@@ -101,12 +102,8 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
     return {
         "modes": K,
         "parameters": n,
-        "ratio": modes["ratio"],
-        "arrive": modes["arrive"],
-        "alone": modes["first"],
-        "rungs": len(ALONE if groups is None else GROUP),
+        **{name: modes[name] for name in ("ratio", "arrive", "alone")},
         "mu": modes["start"],
-        "prior": modes["start"],
         "m": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
         "trend": np.zeros((n, len(TREND))),
@@ -127,9 +124,8 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
 def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
-        "precision": 0.0, "usual_noise": 1.0, "outlying": OUTLIER, "astray": 0.0,
-        "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0,
+        "drift_rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
     }  # fmt: skip
 
 
@@ -168,10 +164,9 @@ def variance_in(s: State, j: int, l: int) -> float:
 @kernel
 def noise_prior(s: State, l: int) -> None:
     """Probabilities of the states before the sample."""
-    usual = 1.0 - s.outlying[l]
+    usual = 1.0 - s.nu_prior[OUTLYING, l]
     s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
     s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
-    s.nu_prior[2, l] = s.outlying[l]
 
 
 @kernel
@@ -200,49 +195,47 @@ def learn_noise(s: State, l: int) -> None:
     """r and f from the moments of the noise of this sample."""
     K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
     usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
-    far = max(variance_in(s, STATES - 1, l), s.e[l] * s.e[l]) + more
-    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.outlier[l]) * usual + s.outlier[l] / far))
+    far = max(variance_in(s, OUTLYING, l), s.e[l] * s.e[l]) + more
+    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.nu[OUTLYING, l]) * usual + s.nu[OUTLYING, l] / far))
     if s.repeats[l] > 0.0:
         return
     ordinary, wild = 0.0, 0.0
     for j in range(STATES):
         least = variance_in(s, j, l)
-        widest = np.inf if j == STATES - 1 else 0.0
+        widest = np.inf if j == OUTLYING else 0.0
         for k in range(K):
             e2, v = s.e_k[k, l] * s.e_k[k, l], s.inverse[j, k, l]
             own = max(least, min(e2, widest))
             s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
         moment = sum_of_row(s, l) / s.noise[l]
-        ordinary += moment if j < STATES - 1 else 0.0
+        ordinary += moment if j < OUTLYING else 0.0
         wild += moment if j > 0 else 0.0
     s.count[l] += 1.0
     # s.nu counts an outlier for the states that were expected
-    away = 1.0 - s.nu[0, l] + s.outlier[l] * s.nu_prior[0, l] / (1.0 - s.outlying[l])
+    away = 1.0 - s.nu[0, l] + s.nu[OUTLYING, l] * s.nu_prior[0, l] / (1.0 - s.nu_prior[OUTLYING, l])
     f = variance_in(s, 1, l) / s.noise[l]
     s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
-    s.outlying[l] += (s.outlier[l] - s.outlying[l]) / (RARITY + min(s.count[l], OFTEN))
-    move = (ordinary / s.r[l] - (1.0 - s.outlier[l])) / min(s.count[l] + 1.0, MEMORY)
+    s.nu_prior[OUTLYING, l] += (s.nu[OUTLYING, l] - s.nu_prior[OUTLYING, l]) / (RARITY + min(s.count[l], OFTEN))
+    move = (ordinary / s.r[l] - (1.0 - s.nu[OUTLYING, l])) / min(s.count[l] + 1.0, MEMORY)
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
-SMOOTHER_FIELDS = ("mu", "r", "usual_noise", "offset", "white", "explained", "settled", "constant")
+SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "settled", "mean", "variance", "c")
 """Fields that are stored at every sample."""
 
 
 @kernel
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
-    for k in range(s.mu.shape[0]):
-        o.mu[k, l] = s.mu[k, l]
     for i in range(s.c.shape[0]):
-        o.offset[i, l], o.white[i, l] = s.offset[i, l], s.white[i, l]
-    o.r[l], o.usual_noise[l] = s.r[l], s.usual_noise[l]
-    o.explained[l], o.settled[l], o.constant[l] = s.explained[l], s.settled[l], s.constant[l]
+        o.white[i, l], o.c[i, l] = s.white[i, l], s.c[i, l]
+        o.mean[i, l], o.variance[i, l] = s.mean[i, l], s.variance[i, l]
+    o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
+    o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
 
 
-def drift_ahead(ratio: Array, mu: Array) -> Array:
-    """The mean over the next `MEMORY` samples of the drift in units of r but for jumps, (T,), of modes mu (T, K)."""
-    total = np.append(0.0, np.cumsum(mu @ np.where(ratio < 1.0, ratio, 0.0)))
-    now = np.arange(len(mu))
-    until = np.minimum(now + int(MEMORY), len(mu))
+def drift_ahead(rate: Array) -> Array:
+    """The mean of the rate (T,) over the next `MEMORY` samples."""
+    total, now = np.append(0.0, np.cumsum(rate)), np.arange(len(rate))
+    until = np.minimum(now + int(MEMORY), len(rate))
     return np.asarray((total[until] - total[now]) / (until - now))
