@@ -20,5 +20,5 @@ def test_a_reader_of_a_paper_finds_the_call(page):
     calls = {name.split(".")[0] for name in re.findall(r"`(?:driftfit(?:\.\w+)*\.)?([A-Z]\w+|\w+(?=\())[(.`]", text)}
     assert len(calls) > 8
     assert {name for name in calls if not any(hasattr(home, name) for home in HOMES)} == set()
-    for heading in ("Symbols and calls", "What was wrong in print, and why", "The open p"):
+    for heading in ("Symbols and calls", "Errata: what was wrong in print, and why", "The open p"):
         assert f"## {heading}" in text
