@@ -47,7 +47,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, pools_of, price
+from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, pools_of, price, union_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -291,24 +291,25 @@ def select(
     search = (keep, most) if isinstance(models, Model) else None
     columns = [(model, y) if data is None else columns_as_outputs(model, y) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
+    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
+    bound = [_bound(model, records.labels.u or records.u.shape[-1]) for model in candidates]
+    names = [repr(model) for model in candidates]
     if any(len(model.outputs) > 1 for model in candidates):
         if gate:
             raise ValueError("select: gate= is for one output; select for one output after the other.")
-        pools = pools_of(candidates, y, u, reading, data, by)
+        pools = pools_of(bound, names, y, u, reading, data, by)
         found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}
         return found["rows"] if candidates[0].shared else ByOutput(found)
-    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
     if data is None and by is None:
         factor("drift", drift, len(records.y))
     elif records.drifts is not None:
         raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
-    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     gate = tracker.gated if gate is None else gate
     records, left_out = decide(max(bound, key=lambda model: model.n), records, gate)
-    names = [repr(model) for model in candidates]
-    pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
+    union, each = union_of(bound), [replace(records.part(k), time=None) for k in range(len(records.keys))]
+    pool, structures = pool_of(bound, names, each, union, union)
     return replace(_selected(pool, structures, tracker, search, beside), left_out=left_out)
 
 
