@@ -26,11 +26,10 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import coefficients, hats, left, order_of, split, white_rows
+from driftfit.judge.changes.fit import coefficients, left, order_of, ramp, rise, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SINGULAR
 from driftfit.judge.changes.which import Which
-from driftfit.judge.statistics.robust import SMALL, invertible
+from driftfit.judge.statistics.robust import invertible
 
 KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
 CORNERS = 24
@@ -128,8 +127,8 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     scores = {"rest": M * np.log(left(Z, z, model.floor)) + n * price}
     if K:
         scores["steps"] = M * np.log(max(changes.rss, model.floor)) + (changes.used + DATE * K) * price
-    ends, path = _ramp(Z, z, phi[:, moves], model, found), np.zeros((N, 0))
-    shapes = [(_rise(N, ends)[:, None], ends, DATE * 2)]
+    ends, path = ramp(phi, model.y, (lags, found.ar, g), moves, CORNERS), np.zeros((N, 0))
+    shapes = [(rise(N, ends)[:, None], ends, DATE * 2)]
     shapes += [(hats(N, knots)[:, 1:], (0, N - 1), 0.0) for knots in KNOTS if len(moves) * knots <= N // 8]
     for shape, own, more in shapes:
         columns = np.hstack([phi[:, j : j + 1] * shape for j in moves])
@@ -150,27 +149,10 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     return Kind(names[likely], weights, ends, path / np.where(size > 0.0, size, 1.0), dates)
 
 
-def _rise(N: int, ends: tuple[int, int]) -> Array:
-    """(N,): 0 up to the first end, 1 from the last one on."""
-    return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
-
-
-def _ramp(Z: Array, z: Array, columns: Array, model: Model, found: Dated) -> tuple[int, int]:
-    """The ends of the best single gradual change of columns (N, J): a rise is the difference of two hinges."""
-    N, J = columns.shape
-    Q = np.linalg.qr(Z)[0]
-    places = np.unique(np.linspace(0, N - 1, min(CORNERS, N // 8) + 1).astype(int))
-    hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * columns[:, None, :]
-    white = white_rows(hinges.reshape(N, -1), model.y, model.noise.lags, found.ar, model.noise.g)[0]
-    white -= Q @ (Q.T @ white)
-    products, b = (white.T @ white).reshape(len(places), J, len(places), J), (z @ white).reshape(-1, J)
-    i, j = np.triu_indices(len(places), 1)
-    A = products[i, :, i] - products[i, :, j] - products[j, :, i] + products[j, :, j]
-    b, long = b[i] - b[j], places[j] - places[i]
-    least = SINGULAR * np.sum(Z**2, axis=0).max() * long**2 + SMALL
-    solution = np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0]
-    best = int(np.argmax(np.sum(b * solution, axis=1)))
-    return int(places[i[best]]), int(places[j[best]])
+def hats(N: int, knots: int) -> Array:
+    """(N, knots): piecewise linear functions, each 1 at its own knot."""
+    at = np.linspace(0.0, N - 1.0, knots)
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
 def _walks(

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.record import Known, Reading, Record, Records
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares, constant_outputs
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -91,16 +91,8 @@ class Pool:
             [np.arange(len(record)) >= start for record, start in zip(self.records, starts, strict=True)]
         )
 
-    def predict(
-        self, tracker: Tracker, structures: Sequence[Candidate], beside: Tracker | None = None
-    ) -> list[Predicted]:
-        """Run structures and return their predictions, or with ``beside`` the mixtures of those of two trackers."""
-        found = self._run(tracker, structures)
-        if beside is None:
-            return found
-        return mixed(found, self._run(beside, structures), self.spans) if structures else found
-
-    def _run(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
+    def predict(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
+        """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
         columns = [k for k, s in enumerate(structures) if s.columns is not None]
         together: dict[int, list[int]] = {}
@@ -155,53 +147,6 @@ def predicted(run: Track) -> Predicted:
     s = run.innovation_std**2
     known = run.ok & np.isfinite(s) & (s > 0.0)
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
-
-
-SHARE = 0.001
-"""Probability that the other tracker is the better one from the next sample on."""
-
-
-def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
-    """Weights (T, K) of one of two predictors where both predict, from the ratio of its density to the other's (T, K);
-    both weigh the same at the ``starts`` of records."""
-    T, K = ratio.shape
-    now, record = np.full(K, 0.5), 0
-    for t in range(T):
-        while record < len(starts) and t == starts[record]:  # a record may be empty
-            now[:] = 0.5
-            record += 1
-        for k in range(K):
-            if both[t, k]:
-                weight[t, k] = now[k]
-                after = now[k] * ratio[t, k]
-                now[k] = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now[k] + after)
-
-
-weigh = Driver(_weights)
-
-
-def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
-    """The mixture of the predictions of two trackers for each structure, weighted by how well they predicted before.
-
-    Where one tracker has no prediction, it is the other's, and the weights rest (Herbster and Warmuth, 1998).
-    """
-    first, second = (np.stack([p.loglik for p in found], axis=1) for found in (ones, others))
-    both = np.isfinite(first) & np.isfinite(second)
-    ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
-    weight = np.where(np.isfinite(first), 0.0, 1.0)
-    weigh(ratio, both, np.array([span.start for span in spans]), weight)
-    with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
-        terms = np.logaddexp(
-            np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),
-            np.where(weight > 0.0, np.log(weight) + second, -np.inf),
-        )
-    result = []
-    for one, other, w, loglik in zip(ones, others, weight.T, terms.T, strict=True):
-        y_hat = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.y_hat + w * other.y_hat, other.y_hat), one.y_hat)
-        apart = w * (1.0 - w) * (one.y_hat - other.y_hat) ** 2
-        s = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.s + w * other.s + apart, other.s), one.s)
-        result.append(Predicted(y_hat, s, loglik))
-    return result
 
 
 def pool_of(
