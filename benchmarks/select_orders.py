@@ -50,7 +50,7 @@ def bic(y: Array, u: Array) -> str:
 
 def jumps(records: int) -> Table:
     """How often the two regressors that count are found where the coefficient of one jumps."""
-    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"True subset found after a jump, % of {records} records")
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title="After a jump")
     table.add_column("best", justify="right")
     rng, found = np.random.default_rng(0), 0
     for _ in range(records):
