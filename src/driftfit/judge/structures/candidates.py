@@ -179,8 +179,9 @@ def union_of(models: Sequence[Model]) -> Model | None:
     models = [model for model in models if linear(model)]
     terms = {term for model in models for term in model.terms or ()}
     constant = ("1", 0, 0) in terms
-    if not models or all(isinstance(model, Regression) for model in models):
-        return replace(models[0], intercept=constant) if models else None  # type: ignore[call-arg]
+    static = [model for model in models if isinstance(model, Regression)]
+    if len(static) == len(models):
+        return replace(static[0], intercept=constant) if static else None
     nb, nk = [], []
     for j in range(models[0].m):
         lags = [lag for what, i, lag in terms if what == "u" and i == j]
