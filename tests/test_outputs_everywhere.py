@@ -379,13 +379,17 @@ def test_frontier_and_select_give_a_result_for_each_output():
     for name in Frontier._fields:
         np.testing.assert_allclose(getattr(found["flow"], name), getattr(alone, name), rtol=1e-6)
     assert isinstance(frontier(shared, z, phi, mu=[1.0]), Frontier)
-    chosen = select([joint, replace(joint, nb=2)], y, u, tracker=TRACKER)
+    union, late = replace(joint, nb=2), replace(joint, nk=2)
+    filled = track(union, Kalman(q=0.0, r=1.0), y, u)  # missing lags are those of all regressors
+    chosen = select([joint, union, late], y, u, tracker=TRACKER)
     assert list(chosen) == ["level", "flow"]
     for name, one in chosen.items():
         again = {row.name: row.loglik for row in one.rows}[repr(joint)]
-        terms = track(Regression(run[name].names), TRACKER, y[:, run.outputs.index(name)], run[name].u).log_density
+        rows = filled[name].u[:, :3]
+        terms = track(Regression(run[name].names), TRACKER, y[:, run.outputs.index(name)], rows).log_density
         assert again == pytest.approx(terms[one.judged].sum() - price(3, unscored(80, 4)), rel=1e-3)
         assert set(one.regressors(repr(joint))) == set(run[name].names)
+        assert one.regressors(repr(late))[-1] == filled[name].names[-1]  # not the column of the first lag
         assert name in str(chosen)
     best = select(joint, y, u, tracker=TRACKER)["level"].best.split()
     assert set(best) <= set(run["level"].names)

@@ -11,7 +11,7 @@ T = 400
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
 
 
-def told(kind, seed=102):
+def told(kind, seed=103):
     """The verdict on a gain that moves beside an intercept that does not."""
     rng, t = np.random.default_rng(seed), np.arange(T)
     path = {
@@ -50,3 +50,14 @@ def test_dates_of_words_are_those_of_segments():
     assert "a random walk" in run.segment().better or not run.segment().better
     walk, _ = told("wandering")
     assert "a random walk" in str(walk.segment())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_level_that_rises_far_is_not_the_noise(seed):
+    """An autoregression with a root of almost 1 explains a ramp as well as the ramp itself does."""
+    rng, t = np.random.default_rng(seed), np.arange(T)
+    u, rise = rng.normal(size=T), 4.0 * np.clip((t - 120) / 160.0, 0.0, 1.0)
+    verdict = track(Regression(["u"], intercept=True), RLS(1.0), rise + u + 0.5 * rng.normal(size=T), u).verdict()
+    assert verdict.drifts
+    assert verdict.moving == ("intercept",)
+    assert verdict.events[0].kind == "gradual"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.identify.result import Effect, Errors, Memory, Move
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import filled, lagged
@@ -21,10 +21,11 @@ from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
-from driftfit.judge.structures.candidates import weigh
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 
+SHARE = 0.001
+"""Probability that the other of two predictions is the better one from the next sample on."""
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
@@ -38,11 +39,23 @@ def density(e: Array) -> Array:
     return np.where(known & (count > LEAST), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
 
 
+def _weigh(ratio: Array, weight: Array) -> None:
+    """`weights` (T,) from the ratios (T,) of both densities."""
+    now = 0.5
+    for t in range(ratio.shape[0]):
+        weight[t], after = now, now * ratio[t]
+        now = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after)
+
+
+_weighed = Driver(_weigh)
+
+
 def weights(first: Array, second: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,)."""
-    ratio, weight = np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0))[:, None], np.empty((len(first), 1))
-    weigh(ratio, np.ones(weight.shape, bool), np.zeros(1, np.int64), weight)
-    return weight[:, 0]
+    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,) (Herbster and
+    Warmuth, 1998)."""
+    weight = np.empty(len(first))
+    _weighed(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)), weight)
+    return weight
 
 
 def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:

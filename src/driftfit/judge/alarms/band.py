@@ -6,7 +6,7 @@ Successive errors of an estimate have the correlation rho = 1 / (1 + d), d = mea
 since a step of the filter has the variance that it removes. A parameter at the very edge of its band begins to exceed a
 limit c with the probability
 
-    P(z_(t-1) <= c, z_t > c) = E [ 1(x <= c) P(rho x + sqrt(1 - rho^2) w > c) ],    x, w ~ N(0, 1)
+    P(z_(t-1) <= c, z_t > c) = 2 T(c, sqrt((1 - rho) / (1 + rho))),    Owen's T (1956)
 
 so c is chosen that one of all parameters does so once in ``every`` samples. Inside the band alarms are rarer.
 """
@@ -24,8 +24,8 @@ from driftfit.judge.alarms.reference import Reference, normal_samples
 from driftfit.run.live.rule import AlarmRule, check_fits
 from driftfit.run.result import Track, burn_in
 
-NODES, FAR = 2001, 9.0
-"""Nodes of the integral, and deviations up to which it goes."""
+FAR = 9.0
+"""Deviations beyond which no limit is."""
 STILL = 1.645
 """A normal variable exceeds this with a probability of 5 %."""
 
@@ -74,14 +74,10 @@ def normal_limit(rho: float, every: float) -> float:
 
     An estimate that hardly moves seldom begins to exceed any limit, but may be beyond it from the first sample on.
     """
-    rho = min(rho, 1.0 - 1e-9)
-    spread = np.sqrt(1.0 - rho * rho)
+    slope = np.sqrt((1.0 - rho) / (1.0 + rho))
 
     def begins(c: float) -> float:
-        # most values that are about to exceed the limit are within a few standard deviations of it
-        x = np.unique(np.concatenate([np.linspace(-FAR, c, NODES), c - spread * np.linspace(0.0, FAR, NODES)]))
-        inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * scipy.special.ndtr((rho * x - c) / spread)
-        return float(np.trapezoid(inside, x))
+        return 2.0 * float(scipy.special.owens_t(c, slope))
 
     rate = max(1.0 / every, begins(FAR))
     return STILL if begins(STILL) <= rate else float(scipy.optimize.brentq(lambda c: begins(c) - rate, STILL, FAR))

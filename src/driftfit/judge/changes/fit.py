@@ -5,14 +5,15 @@
 Breaks and correlation explain the same residuals. For each start, the white noise and the correlation of the residuals
 of constants, the best partition on cells (Jackson et al., 2005) and the lags of the noise follow each other until they
 stay; the pair with the smaller criterion counts. A break costs (n + 2) log N there (Zhang and Siegmund, 2007), a lag
-log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). Weights limit what a row adds to
-the sum of squares, at three levels from the fit of segments. Where residuals clearly grow with a regressor x, the level
-is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
+log N, and a lag of a season 2 log of their number more (Chen and Chen, 2008). A gradual change of all parameters, on a
+straight line, is tried beside the segments, since an autoregression takes it for noise. Weights limit what a row adds
+to the sum of squares, at three levels from the fit of segments. Where residuals clearly grow with a regressor x, the
+level is in proportion to sqrt(a + b x^2). Cost: O(N n^2) and O(c^2 n^3) for c cells.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +35,8 @@ ORDER = 6
 """Largest order of the autoregression; a season may add one further lag."""
 SEASON = 24
 ROUNDS = 4
-SETTLED = 0.1
-"""Standard deviation of the logarithm of a change of weights after which segments and lags are searched again."""
-KNOTS = (3, 5, 9, 17, 33)
-"""Knots of lines that parameters may move on."""
+CORNERS = 12
+"""Cells at whose ends a gradual change may begin or end."""
 MOST = 12
 """Largest number of breaks."""
 WINDOWS = 12
@@ -56,7 +55,7 @@ class Noise(NamedTuple):
     g: Array
     """(N,): roots of the weights."""
     e: Array
-    """(N,): white residuals of the segments or lines, 0 in the first rows."""
+    """(N,): white residuals of the segments or the gradual change, 0 in the first rows."""
     rows: Array
     """(N, q): the regressors of these."""
     fewest: int
@@ -137,21 +136,6 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
-def _multiply(v: Array, G: Array) -> None:
-    """G (k, k), a lower triangle: sums of products of v (N,) with the lags 1 .. k - 1, and last of v itself, from row
-    k - 1 on; those of two lags follow from those of one less each."""
-    last, N = G.shape[0] - 1, v.shape[0]
-    for i in range(last + 1):
-        for t in range(last, N):
-            G[last, i - 1 if i > 0 else last] += v[t] * v[t - i]
-        for j in range(1, last + 1 - i):
-            before = G[i + j - 2, j - 2] if j > 1 else G[last, i - 1 if i > 0 else last]
-            G[i + j - 1, j - 1] = before + v[last - i - j] * v[last - j] - v[N - i - j] * v[N - j]
-
-
-_multiplied = Driver(_multiply)
-
-
 def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
     """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
     last = G.shape[0] - 1
@@ -183,24 +167,16 @@ _chosen = Driver(_choose)
 def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
     """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
     Only rows are used that are ``ok`` (N,), as are all their lags."""
-    N = len(v)
-    limit = HELD * deviation(v if ok is None else v[ok])
-    if most < 1:
+    N, found = len(v), np.zeros(2, np.int64)
+    ok = np.ones(N, bool) if ok is None else ok
+    limit, longest = HELD * deviation(v[ok]), max(most, min(season, N // 12))
+    while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
+        longest -= 1  # fewer lags are known of more rows
+    if most < 1 or len(at) <= 2 * longest:
         return NONE
-    longest, found = max(most, min(season, N // 12)), np.zeros(2, np.int64)
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
-    if ok is None:
-        count, G = N - longest, np.zeros((longest + 1, longest + 1))
-        if count > 2 * longest:
-            _multiplied(v, G)
-    else:
-        while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
-            longest -= 1  # fewer lags are known of more rows
-        rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
-        count, G = len(at), rows.T @ rows
-    if count <= 2 * longest:
-        return NONE
-    _chosen(G, count, min(most, longest), found)
+    rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
+    _chosen(rows.T @ rows, len(at), min(most, longest), found)
     lags = np.arange(1, found[0] + 1)
     return np.append(lags, found[1]) if found[1] else lags
 
@@ -225,37 +201,29 @@ def level_of(e: Array, first: int) -> Array:
     return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 
-@lru_cache(2 * len(KNOTS))
-def hats(N: int, knots: int) -> Array:
-    """(N, knots): piecewise linear functions, each 1 at its own knot."""
-    at = np.linspace(0.0, N - 1.0, knots)
-    return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
+def rise(N: int, ends: tuple[int, int]) -> Array:
+    """(N,): 0 up to the first end, 1 from the last one on."""
+    return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
 
 
-def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
-    """Sums of products G (knots n + 1, ..) of z (M,) and of Z (M, n) times hats (M, knots): of two of these at most."""
-    n, last, k = Z.shape[1], G.shape[0] - 1, 0
-    for t in range(Z.shape[0]):
-        while k + 2 < hat.shape[1] and not hat[t, k] > 0.0:
-            k += 1
-        for j in range(n):
-            row[j], row[n + j] = Z[t, j] * hat[t, k], Z[t, j] * hat[t, k + 1]
-        for i in range(2 * n):
-            for j in range(2 * n):
-                G[k * n + i, k * n + j] += row[i] * row[j]
-            G[last, k * n + i] += row[i] * z[t]
-
-
-_accumulated = Driver(_accumulate)
-
-
-def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
-    """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N."""
-    n, hat = Z.shape[1], hats(N, knots)
-    own, G = hat[N - len(z) :], np.zeros((knots * n + 1, knots * n + 1))
-    _accumulated(Z, z, own, np.empty(2 * n), G)
-    path = hat @ np.linalg.solve(invertible(G[:-1, :-1]), G[-1, :-1]).reshape(knots, n)
-    return path, z - np.einsum("tj,tj->t", Z, path[N - len(z) :])
+def ramp(X: Array, y: Array, noise: tuple[Array, Array, Array], moves: Sequence[int], corners: int) -> tuple[int, int]:
+    """The ends of the best gradual change of some of the columns X (N, n), on straight lines between any two of so many
+    corners, for noise of (lags, ar, g): a rise is the difference of two hinges."""
+    N, J = len(y), len(moves)
+    Z, z = white_rows(X, y, *noise)
+    Q = np.linalg.qr(Z)[0]
+    places = np.unique(np.linspace(0, N - 1, min(corners, N // 8) + 1).astype(int))
+    hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * X[:, None, moves]
+    white = white_rows(hinges.reshape(N, -1), y, *noise)[0]
+    white -= Q @ (Q.T @ white)
+    products, b = (white.T @ white).reshape(len(places), J, len(places), J), (z @ white).reshape(-1, J)
+    i, j = np.triu_indices(len(places), 1)
+    A = products[i, :, i] - products[i, :, j] - products[j, :, i] + products[j, :, j]
+    b, long = b[i] - b[j], places[j] - places[i]
+    least = SINGULAR * np.sum(Z**2, axis=0).max() * long**2 + SMALL
+    solution = np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0]
+    best = int(np.argmax(np.sum(b * solution, axis=1)))
+    return int(places[i[best]]), int(places[j[best]])
 
 
 def divided(
@@ -273,8 +241,8 @@ def divided(
 def together(
     X: Array, y: Array, g: Array, order: int | None, most: int, given: int | None = None
 ) -> tuple[Array, Array, Array]:
-    """(lags, ar, regressors of the path), chosen together: segments, or lines between knots; segments with the lags of
-    an ``order`` if that is given."""
+    """(lags, ar, regressors of the path), chosen together: segments, or a gradual change; segments with the lags of an
+    ``order`` if that is given."""
     N, n = X.shape
     theta, _ = estimated(X, y, (NONE, np.zeros(0), g), NONE)
     best: tuple[float, Array, Array, Array] | None = None  # criterion, lags, ar, rows
@@ -292,18 +260,15 @@ def together(
             theta, _ = estimated(X, y, (lags, ar, g), breaks)
             lags = lags_of(noise_of(X, y, theta, breaks) * g, orders) if order is None else lags
     assert best is not None
-    for knots in KNOTS:
-        if n * knots > N // 8 or order is not None:
-            break
-        path, r = on_lines(X * g[:, None], y * g, N, knots)
-        v = y - np.einsum("tj,tj->t", X, path)
+    if order is None:
+        white = NONE, np.zeros(0), g
+        rows = np.hstack([X, X * rise(N, ramp(X, y, white, range(n), CORNERS))[:, None]])
+        v = y - rows @ coefficients(rows * g[:, None], y * g)
         lags = lags_of(v * g, orders)
         ar = regressed(v, g, lags)
-        if len(lags):
-            _, r = on_lines(*white_rows(X, y, lags, ar, g), N, knots)
-        criterion = N * np.log(max(float(r @ r), SMALL)) + (n * (knots - 1) + len(lags)) * np.log(N)
+        criterion = N * np.log(left(*white_rows(rows, y, lags, ar, g))) + (n + 2 + len(lags)) * np.log(N)
         if criterion < best[0]:
-            best = criterion, lags, ar, np.asarray((hats(N, knots)[:, :, None] * X[:, None, :]).reshape(N, -1))
+            best = criterion, lags, ar, rows
     return best[1:]
 
 
@@ -339,13 +304,11 @@ def noise(X: Array, y: Array, phi: Array, constants: Fit, order: int | None = No
     level *= spread(e / level, phi, ranked)
     g = weights(e, level)
     lags, ar, rows = together(X, y, g, order, most, fewest)
-    for last in (False, True):
-        first = order_of(lags)
+    first = order_of(lags)
+    for _ in range(2):
         v = y - rows @ coefficients(*white_rows(rows, y, lags, ar, g))
         e = np.append(np.zeros(first), white_rows(v[:, None], v, lags, ar, np.ones(N))[1])
         size = spread(e, phi, ranked)
         level = size * level_of(e / size, first)
-        before, g = g, weights(e, level)
-        if not last and np.std(np.log(g / before)) > SETTLED:
-            lags, ar, rows = together(X, y, g, order, most, fewest)
+        g = weights(e, level)
     return Noise(lags, ar, level, g, e, rows, shortest(n, lags, fewest), ranked)

@@ -4,14 +4,13 @@
 
     rest      constants
     steps     the segments, with the changes that are needed
-    gradual   theta_j constant, then on a straight line from one date to another, then constant; or continuous lines
-              between evenly spaced knots
+    gradual   theta_j constant, then on a straight line from one date to another, then constant
     walk      theta_j(t) = theta_j(t - 1) + w_t,  var w = q / mean(x_j^2); f_t are the variances of its innovations, and
               constants are estimated on the innovations of all columns
     jumps     the walk, with those steps that it still needs
 
-A date costs as much as a coefficient. The walk is tried beside the noise of the segments
-and beside white noise, since an autoregression takes a walk for noise. The weights of the kinds are exp(-BIC / 2).
+A date costs as much as a coefficient. The walk is tried beside the noise of the segments and beside white noise, since
+an autoregression takes a walk for noise. The weights of the kinds are exp(-BIC / 2).
 
 Source: Schwarz (1978); Ansley and Kohn (1985) for constants beside a filter. Cost: O(N) for each of some hundred
 paths.
@@ -23,16 +22,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import coefficients, hats, left, order_of, split, white_rows
+from driftfit.judge.changes.fit import coefficients, left, order_of, ramp, rise, split, white_rows
 from driftfit.judge.changes.null import Model
-from driftfit.judge.changes.scan import SINGULAR
 from driftfit.judge.changes.which import Which
-from driftfit.judge.statistics.robust import SMALL, invertible
+from driftfit.judge.statistics.robust import invertible
 
-KNOTS = (3, 4, 5, 6, 8, 10, 13, 17, 22, 28)
 CORNERS = 24
 """Cells at whose ends a gradual change may begin or end."""
 STEPS = 10.0 ** np.arange(-7.0, 0.5, 0.5)
@@ -128,49 +126,18 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     scores = {"rest": M * np.log(left(Z, z, model.floor)) + n * price}
     if K:
         scores["steps"] = M * np.log(max(changes.rss, model.floor)) + (changes.used + DATE * K) * price
-    ends, path = _ramp(Z, z, phi[:, moves], model, found), np.zeros((N, 0))
-    shapes = [(_rise(N, ends)[:, None], ends, DATE * 2)]
-    shapes += [(hats(N, knots)[:, 1:], (0, N - 1), 0.0) for knots in KNOTS if len(moves) * knots <= N // 8]
-    for shape, own, more in shapes:
-        columns = np.hstack([phi[:, j : j + 1] * shape for j in moves])
-        both = np.hstack([Z, white_rows(columns, model.y, lags, found.ar, g)[0]])
-        beta = coefficients(both, z)
-        rss = max(float(np.sum((z - both @ beta) ** 2)), model.floor)
-        score = M * np.log(rss) + (len(beta) + more) * price
-        if score < scores.get("gradual", np.inf):
-            scores["gradual"], ends, path = score, own, np.tile(beta[:n], (N, 1))
-            path[:, moves] += shape @ beta[n:].reshape(len(moves), -1).T
+    ends, J = ramp(phi, model.y, (lags, found.ar, g), moves, CORNERS), len(moves)
+    shape = rise(N, ends)[:, None]
+    both = np.hstack([Z, white_rows(shape * phi[:, moves], model.y, lags, found.ar, g)[0]])
+    scores["gradual"] = M * np.log(left(both, z, model.floor)) + (n + J + DATE * 2) * price
+    beta = coefficients(both, z)
+    path = np.tile(beta[:n], (N, 1))
+    path[:, moves] += shape * beta[n:]
     scores["walk"], scores["jumps"], dates = _walks(phi, model, found, changes, moves)
-    low = min(scores.values())
-    weights = {name: float(np.exp(-0.5 * (score - low))) for name, score in scores.items()}
-    total = sum(weights.values())
-    weights = {name: weight / total for name, weight in weights.items()}
+    weights = dict(zip(scores, scipy.special.softmax(-0.5 * np.array([*scores.values()])).tolist(), strict=True))
     names = {"rest": "", "steps": "steps", "gradual": "gradual", "walk": "wandering", "jumps": "drift with jumps"}
     likely = max((name for name in weights if name != "rest"), key=lambda name: weights[name])
     return Kind(names[likely], weights, ends, path / np.where(size > 0.0, size, 1.0), dates)
-
-
-def _rise(N: int, ends: tuple[int, int]) -> Array:
-    """(N,): 0 up to the first end, 1 from the last one on."""
-    return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
-
-
-def _ramp(Z: Array, z: Array, columns: Array, model: Model, found: Dated) -> tuple[int, int]:
-    """The ends of the best single gradual change of columns (N, J): a rise is the difference of two hinges."""
-    N, J = columns.shape
-    Q = np.linalg.qr(Z)[0]
-    places = np.unique(np.linspace(0, N - 1, min(CORNERS, N // 8) + 1).astype(int))
-    hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * columns[:, None, :]
-    white = white_rows(hinges.reshape(N, -1), model.y, model.noise.lags, found.ar, model.noise.g)[0]
-    white -= Q @ (Q.T @ white)
-    products, b = (white.T @ white).reshape(len(places), J, len(places), J), (z @ white).reshape(-1, J)
-    i, j = np.triu_indices(len(places), 1)
-    A = products[i, :, i] - products[i, :, j] - products[j, :, i] + products[j, :, j]
-    b, long = b[i] - b[j], places[j] - places[i]
-    least = SINGULAR * np.sum(Z**2, axis=0).max() * long**2 + SMALL
-    solution = np.linalg.solve(A + least[:, None, None] * np.eye(J), b[..., None])[..., 0]
-    best = int(np.argmax(np.sum(b * solution, axis=1)))
-    return int(places[i[best]]), int(places[j[best]])
 
 
 def _walks(

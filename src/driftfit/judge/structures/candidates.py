@@ -8,8 +8,7 @@ columns of zeros after its own, whose parameters are known to be 0 (`Tracker.par
 that take a driver for each number of columns. Several records are run separately, each from the start, and written one
 after the other.
 
-Of models with several outputs each output is a regression, whose columns are known by their names. Every candidate is
-run once with constant parameters, which gives these regressors with missing lags filled.
+Of models with several outputs each output is a regression on the same columns.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.record import Known, Reading, Record, Records
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares, constant_outputs
 from driftfit.models.arx import ARX
-from driftfit.models.base import Model, Term
+from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
@@ -32,6 +31,7 @@ from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
 
 TOGETHER = 32
+Candidates = tuple["Pool", list["Candidate"]]
 
 
 class Candidate(NamedTuple):
@@ -91,16 +91,8 @@ class Pool:
             [np.arange(len(record)) >= start for record, start in zip(self.records, starts, strict=True)]
         )
 
-    def predict(
-        self, tracker: Tracker, structures: Sequence[Candidate], beside: Tracker | None = None
-    ) -> list[Predicted]:
-        """Run structures and return their predictions, or with ``beside`` the mixtures of those of two trackers."""
-        found = self._run(tracker, structures)
-        if beside is None:
-            return found
-        return mixed(found, self._run(beside, structures), self.spans) if structures else found
-
-    def _run(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
+    def predict(self, tracker: Tracker, structures: Sequence[Candidate]) -> list[Predicted]:
+        """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
         columns = [k for k, s in enumerate(structures) if s.columns is not None]
         together: dict[int, list[int]] = {}
@@ -157,120 +149,63 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
-SHARE = 0.001
-"""Probability that the other tracker is the better one from the next sample on."""
+def pool_of(
+    models: Sequence[Model], names: Sequence[str], records: Sequence[Record], union: Model | None, own: Model | None
+) -> Candidates:
+    """The records with the regressors of the union of bound models, and the models as structures.
 
-
-def _weights(ratio: Array, both: Array, starts: Array, weight: Array) -> None:
-    """Weights (T, K) of one of two predictors where both predict, from the ratio of its density to the other's (T, K);
-    both weigh the same at the ``starts`` of records."""
-    T, K = ratio.shape
-    now, record = np.full(K, 0.5), 0
-    for t in range(T):
-        while record < len(starts) and t == starts[record]:  # a record may be empty
-            now[:] = 0.5
-            record += 1
-        for k in range(K):
-            if both[t, k]:
-                weight[t, k] = now[k]
-                after = now[k] * ratio[t, k]
-                now[k] = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now[k] + after)
-
-
-weigh = Driver(_weights)
-
-
-def mixed(ones: Sequence[Predicted], others: Sequence[Predicted], spans: Sequence[slice]) -> list[Predicted]:
-    """The mixture of the predictions of two trackers for each structure, weighted by how well they predicted before.
-
-    Where one tracker has no prediction, it is the other's, and the weights rest (Herbster and Warmuth, 1998).
+    ``own`` is the regression that has these regressors: the union, or that of one of its outputs.
     """
-    first, second = (np.stack([p.loglik for p in found], axis=1) for found in (ones, others))
-    both = np.isfinite(first) & np.isfinite(second)
-    ratio = np.exp(np.clip(np.where(both, second - first, 0.0), -700.0, 700.0))
-    weight = np.where(np.isfinite(first), 0.0, 1.0)
-    weigh(ratio, both, np.array([span.start for span in spans]), weight)
-    with np.errstate(divide="ignore", invalid="ignore"):  # one without a prediction has the weight 0
-        terms = np.logaddexp(
-            np.where(weight < 1.0, np.log1p(-weight) + first, -np.inf),
-            np.where(weight > 0.0, np.log(weight) + second, -np.inf),
-        )
-    result = []
-    for one, other, w, loglik in zip(ones, others, weight.T, terms.T, strict=True):
-        y_hat = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.y_hat + w * other.y_hat, other.y_hat), one.y_hat)
-        apart = w * (1.0 - w) * (one.y_hat - other.y_hat) ** 2
-        s = np.where(w > 0.0, np.where(w < 1.0, (1.0 - w) * one.s + w * other.s + apart, other.s), one.s)
-        result.append(Predicted(y_hat, s, loglik))
-    return result
+    phi, gaps, order = np.zeros((sum(map(len, records)), 0)), np.ones(sum(map(len, records))), {}
+    if union is not None and own is not None:
+        rows = np.concatenate([constant_least_squares(own, record) for record in records])
+        phi, gaps = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan), rows["dt"][:, 0].copy()
+        order = {term: i for i, term in enumerate(union.terms or ())}
+    columns = [tuple(order[term] for term in model.terms or ()) if linear(model) else None for model in models]
+    structures = [
+        Candidate(name, model.n if at is None else len(at), model, at)
+        for name, model, at in zip(names, models, columns, strict=True)
+    ]
+    return Pool(tuple(records), phi, () if own is None else own.names, gaps), structures
 
 
-def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Record]) -> tuple[Pool, list[Candidate]]:
-    """The records with the union of the models' regressors, and the models as structures; models are bound."""
-    linear = [model for model in models if _terms(model) is not None]
-    if not linear:
-        T = sum(map(len, records))
-        empty = Pool(tuple(records), np.zeros((T, 0)), (), np.ones(T))
-        return empty, [Candidate(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
-    union = _union(linear)
-    order = {term: i for i, term in enumerate(_terms(union) or ())}
-    rows = np.concatenate([constant_least_squares(union, record) for record in records])
-    phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
-    pool = Pool(tuple(records), phi, union.names, rows["dt"][:, 0].copy())
-    structures = []
-    for name, model in zip(names, models, strict=True):
-        terms = _terms(model)
-        columns = None if terms is None else tuple(order[term] for term in terms)
-        structures.append(Candidate(name, model.n, model, columns))
-    return pool, structures
+def linear(model: Model) -> bool:
+    """Whether the regressors of a model are columns of known signals."""
+    return model.terms is not None and not model.implicit
 
 
-def _terms(model: Model) -> tuple[Term, ...] | None:
-    """The terms of the columns of a model with one output; None for a model whose regressors are no columns."""
-    return None if len(model.outputs) > 1 or model.implicit else model.terms
-
-
-def _union(models: Sequence[Model]) -> Model:
-    """The smallest model that contains the regressors of all."""
-    terms = {term for model in models for term in _terms(model) or ()}
+def union_of(models: Sequence[Model]) -> Model | None:
+    """The smallest model that contains the regressors of all models that are `linear`; None without any."""
+    models = [model for model in models if linear(model)]
+    terms = {term for model in models for term in model.terms or ()}
     constant = ("1", 0, 0) in terms
-    inputs = models[0].input_names or models[0].m
-    if all(isinstance(model, Regression) for model in models) and all(lag == 0 for _, _, lag in terms):
-        return Regression(inputs, intercept=constant)
-    na = max((lag for what, _, lag in terms if what == "y"), default=0)
+    static = [model for model in models if isinstance(model, Regression)]
+    if len(static) == len(models):
+        return replace(static[0], intercept=constant) if static else None
     nb, nk = [], []
     for j in range(models[0].m):
         lags = [lag for what, i, lag in terms if what == "u" and i == j]
         nk.append(min(lags, default=0))
         nb.append(max(lags) - nk[-1] + 1 if lags else 0)
     start = next((model.start for model in models if isinstance(model, ARX)), "drop")
-    return ARX(na, tuple(nb), nk=tuple(nk), inputs=inputs, intercept=constant, start=start)
+    na = max((lag for what, _, lag in terms if what == "y"), default=0)
+    ny = models[0].outputs if len(models[0].outputs) > 1 else 1
+    inputs = models[0].input_names or models[0].m
+    return ARX(na, tuple(nb), nk=tuple(nk), inputs=inputs, intercept=constant, start=start, ny=ny)
 
 
-Candidates = tuple[Pool, list[Candidate]]
-
-
-def pools_of(models: Sequence[Model], y: Any, u: Any, reading: Reading, data: Any, by: Any) -> dict[str, Candidates]:
-    """The union of the candidates' regressors, and the candidates, for each output; one entry if they share a theta."""
-    found = [constant_outputs(model, y, u, reading, data, by) for model in models]
-    for model, runs in zip(models, found, strict=True):
-        if runs.keys() != found[0].keys() or model.implicit:
-            raise ValueError(
-                f"select: several outputs are compared for ARX or Regression models with the same outputs; got "
-                f"{models[0]!r} and {model!r}."
-            )
-    return {name: _pool(models, [runs[name] for runs in found]) for name in found[0]}
-
-
-def _pool(models: Sequence[Model], candidates: Sequence[Sequence[Track]]) -> Candidates:
-    """The pool of one output; every candidate has a run for each record."""
-    columns: dict[str, Array] = {}
-    gaps = []
-    for runs in candidates:
-        rows = np.concatenate([constant_least_squares(run.model, run.record) for run in runs])
-        phi = np.where(rows["valid"] > 0.0, rows["phi"][..., 0], np.nan)
-        columns = dict(zip(runs[0].names, phi.T, strict=True)) | columns
-        gaps.append(rows["dt"][:, 0])
-    names, records = tuple(columns), tuple(replace(run.record, time=None) for run in candidates[0])
-    pool = Pool(records, np.column_stack(list(columns.values())), names, np.min(gaps, axis=0))
-    places = [tuple(names.index(name) for name in runs[0].names) for runs in candidates]
-    return pool, [Candidate(repr(one), len(at), one, at) for one, at in zip(models, places, strict=True)]
+def pools_of(
+    models: Sequence[Model], names: Sequence[str], y: Any, u: Any, reading: Reading, data: Any, by: Any
+) -> dict[str, Candidates]:
+    """The same for each output of bound models that have several; one entry if these share a theta."""
+    if any(one.outputs != models[0].outputs or one.shared != models[0].shared or not linear(one) for one in models):
+        raise ValueError(
+            f"select: several outputs are compared for ARX or Regression models with the same outputs; got "
+            f"{', '.join(map(repr, models))}."
+        )
+    union = union_of(models)
+    assert union is not None
+    return {
+        name: pool_of(models, names, [replace(run.record, time=None) for run in runs], union, runs[0].model)
+        for name, runs in constant_outputs(union, y, u, reading, data, by).items()
+    }

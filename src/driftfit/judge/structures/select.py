@@ -8,10 +8,6 @@ is the tracker's predictive density, a mixture if it has several modes. All stru
 those after the first m that all of them could predict, m = max(50, 5 n of the largest, min(100, T / 2)). The term
 (n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
-Without a tracker of the user's, and where all structures are columns of one regression, p is the mixture of the
-densities of `AdaptiveKalman` and of constant least squares, `FLS(inf)`: what the first pays for being prepared for a
-drift differs at random between structures, and would hide a superfluous parameter where nothing drifts.
-
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
   columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures run
   in parallel as lanes of one compiled driver, as wide as the largest of them. Other models, such as
@@ -47,7 +43,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, pools_of, price
+from driftfit.judge.structures.candidates import Candidate, Pool, Predicted, pool_of, pools_of, price, union_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -56,7 +52,6 @@ from driftfit.run.track import Decisions, decide, records_of
 from driftfit.show.text import ByOutput, Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.fls import FLS
 
 if TYPE_CHECKING:
     import polars
@@ -256,8 +251,7 @@ def select(
         As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
         from the start, the logliks are added, and the first m samples of each are not scored.
     tracker : Tracker
-        Estimates their parameters; by default AdaptiveKalman(), and FLS(inf) beside it where structures are columns of
-        one regression: their predictions are mixed. Its settings must fit every number of parameters: one
+        Estimates their parameters; by default AdaptiveKalman(). Its settings must fit every number of parameters: one
         q, not a vector.
     gate : bool, `Gate`, decisions of a run or None
         As for `track`. The gate decides once, by a run of `AdaptiveKalman` on the largest model, and what it leaves out
@@ -277,7 +271,6 @@ def select(
         If there is no candidate, for a tracker without a variance, more than 30 regressors or unknown names, and for
         everything that `track` does not accept.
     """
-    beside = FLS(np.inf) if tracker is None else None  # RLS(1.0) bit for bit, but all structures share a driver
     tracker = AdaptiveKalman() if tracker is None else tracker
     candidates = list(models) if isinstance(models, Iterable) and not isinstance(models, str) else [models]
     for model in candidates:
@@ -291,25 +284,26 @@ def select(
     search = (keep, most) if isinstance(models, Model) else None
     columns = [(model, y) if data is None else columns_as_outputs(model, y) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
+    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
+    bound = [_bound(model, records.labels.u or records.u.shape[-1]) for model in candidates]
+    names = [repr(model) for model in candidates]
     if any(len(model.outputs) > 1 for model in candidates):
         if gate:
             raise ValueError("select: gate= is for one output; select for one output after the other.")
-        pools = pools_of(candidates, y, u, reading, data, by)
-        found = {name: _selected(*pool, tracker, search, beside) for name, pool in pools.items()}
+        pools = pools_of(bound, names, y, u, reading, data, by)
+        found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
         return found["rows"] if candidates[0].shared else ByOutput(found)
-    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
     if data is None and by is None:
         factor("drift", drift, len(records.y))
     elif records.drifts is not None:
         raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
-    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     gate = tracker.gated if gate is None else gate
     records, left_out = decide(max(bound, key=lambda model: model.n), records, gate)
-    names = [repr(model) for model in candidates]
-    pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
-    return replace(_selected(pool, structures, tracker, search, beside), left_out=left_out)
+    union, each = union_of(bound), [replace(records.part(k), time=None) for k in range(len(records.keys))]
+    pool, structures = pool_of(bound, names, each, union, union)
+    return replace(_selected(pool, structures, tracker, search), left_out=left_out)
 
 
 def _selected(
@@ -317,16 +311,13 @@ def _selected(
     structures: list[Candidate],
     tracker: Tracker,
     search: tuple[Sequence[str], int | None] | None,
-    beside: Tracker | None,
 ) -> Selection:
     """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
-    if any(one.columns is None for one in structures):
-        beside = None  # other models run one by one, and would have to compile another driver
     if search is None:
-        return _judged(pool, tracker, structures, pool.predict(tracker, structures, beside))
+        return _judged(pool, tracker, structures, pool.predict(tracker, structures))
     if structures[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {structures[0].n}.")
-    structures, predictions = subsets(pool, tracker, structures[0], *search, beside)
+    structures, predictions = subsets(pool, tracker, structures[0], *search)
     return _judged(pool, tracker, structures, predictions)
 
 

@@ -27,7 +27,6 @@ def subsets(
     full: Candidate,
     keep: Sequence[str],
     most: int | None,
-    beside: Tracker | None = None,
 ) -> tuple[list[Candidate], list[Predicted]]:
     """Subsets of the regressors of one model: all, or those that a search visits."""
     if full.columns is None:
@@ -39,7 +38,7 @@ def subsets(
     largest = N if most is None else whole("select", "most", most, 1)
     kept = frozenset(pool.names.index(name) for name in keep)
     free = [i for i in range(N) if i not in kept]
-    tried = Tried(pool, tracker, beside)
+    tried = Tried(pool, tracker)
     if len(free) <= ALL:
         every = [kept | set(c) for r in range(len(free) + 1) for c in combinations(free, r)]
         tried([chosen for chosen in every if 0 < len(chosen) <= largest])
@@ -51,8 +50,8 @@ def subsets(
 class Tried:
     """Subsets that were run, each once."""
 
-    def __init__(self, pool: Pool, tracker: Tracker, beside: Tracker | None) -> None:
-        self.pool, self.tracker, self.beside = pool, tracker, beside
+    def __init__(self, pool: Pool, tracker: Tracker) -> None:
+        self.pool, self.tracker = pool, tracker
         self.structures: list[Candidate] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
@@ -66,7 +65,7 @@ class Tried:
         structures = [
             Candidate(" ".join(self.pool.names[i] for i in sorted(s)), len(s), None, tuple(sorted(s))) for s in new
         ]
-        predictions = self.pool.predict(self.tracker, structures, self.beside)
+        predictions = self.pool.predict(self.tracker, structures)
         for subset, structure, found in zip(new, structures, predictions, strict=True):
             self._place[subset] = len(self.structures)
             self.structures.append(structure)
