@@ -20,10 +20,9 @@ def walks(lane, jump=JUMPS):
     rho = lane["r"] * np.where(lane["ratio"] == JUMPS, jump, lane["ratio"])
     mean, v, away = lane["mean"], lane["variance"], np.eye(n)
     moving = v > filters.STILL * c
-    centred = moving & (c > (1.0 + filters.FAR) * v) & np.any(~moving & (mean != 0.0))
-    if centred.any():
-        constant = np.flatnonzero(~moving & (mean != 0.0))[-1]
-        away[constant] -= np.where(centred, mean / mean[constant], 0.0)
+    constant = np.flatnonzero(~moving & (mean != 0.0))[-1:]
+    centred = moving & (c > (1.0 + filters.FAR) * v) & (len(constant) > 0)
+    away[constant] -= np.where(centred, mean / mean[constant, None], 0.0)
     common = (away / np.where(centred, v, np.where(c > 0.0, c, np.inf))) @ away.T
     a = np.divide(lane["sums"][of_noise.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
