@@ -104,7 +104,9 @@ def sample(lane, phi, y):
 
 def interaction(lane, mu, m, C):
     """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
-    arrive, down = lane["arrive"], lane["down"]
+    ratio, arrive = lane["ratio"], lane["arrive"]
+    down = np.where(ratio < 1.0, of_noise.DOWN, np.where(ratio < JUMPS, of_noise.AFTER, of_noise.ENDS))
+    down *= np.append(False, np.diff(ratio) > 0.0)
     T = np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive
     share = mu[:, None] * T
     prior = share.sum(axis=0)

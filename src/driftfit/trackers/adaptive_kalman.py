@@ -21,8 +21,8 @@ this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves. The variance before a sample is for samples that are no outliers: the geometric mean, by their
-probabilities, of the variances with and without a jump in the last samples. While samples come, the covariance counts
-jumps that none of them has ruled out; ahead of the last one, none that begin then: a forecast holds until theta jumps.
+probabilities, of the variances with and without a jump in the last samples. The covariance has jumps that no sample
+ruled out; that of a forecast has none after the last sample: it holds until theta jumps.
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
 Student's (`driftfit.trackers.student`). Every filter starts from generalised least squares with its own

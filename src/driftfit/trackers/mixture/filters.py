@@ -31,9 +31,12 @@ from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.forms.covariance import LEFT
 from driftfit.trackers.mixture.states import (
+    AFTER,
     COMMON,
     DIRECTION,
+    DOWN,
     DRIFT,
+    ENDS,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
@@ -312,15 +315,12 @@ def enter_filters(s: State, j: int, l: int) -> None:
 
 @partial(kernel, inline=False)
 def mixture(s: State, l: int) -> None:
-    """Mean d of the filters, and the covariance of theta that is reported; without a sample d keeps its bits, and jumps
-    that the last interaction brought, of which no sample tells yet, are not in the covariance.
-    """
+    """Mean d and reported covariance of the filters; without a sample d keeps its bits, and no large jump begins."""
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
-    s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
-    for k in range(K):
         s.curve[k, l] = s.mu[k, l] if s.ok[l] > 0.0 or s.ratio[k, l] < JUMPS else max(s.mu[k, l] - s.arrive[k, l], 0.0)
+    s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
@@ -348,7 +348,8 @@ def mix(s: State, l: int) -> None:
     """
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
-        s.row[k, l] = s.mu[k, l] * s.down[k, l]
+        down = ENDS if s.ratio[k, l] >= JUMPS else AFTER if s.ratio[k, l] >= 1.0 else DOWN
+        s.row[k, l] = s.mu[k, l] * down if s.ratio[max(k - 1, 0), l] < s.ratio[k, l] else 0.0  # the lowest stays
     s.row[K, l] = 0.0
     for k in range(K):
         above, stays = s.row[k + 1, l], (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]

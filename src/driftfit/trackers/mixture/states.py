@@ -75,9 +75,8 @@ LEAST_SHARE = 1e-26
 
 def table(n: int, groups: Any) -> dict[str, Array]:
     """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
-    probabilities ``arrive`` from the whole bank, ``down`` to the next smaller ratio, and ``start``, before the first
-    sample. And ``alone`` (2, n): the first mode of the ladder in which a parameter drifts without all others, and the
-    one after the last.
+    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``alone`` (2, n): the
+    first mode of the ladder in which a parameter drifts without all others, and the one after the last.
     """
     each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
     ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
@@ -88,14 +87,13 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     arrive = np.where(jump, JUMP, DRIFT / np.sum(~jump))
     for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
         arrive[jump & kind] *= share / max(int(np.sum(jump & kind)), 1)
-    down = np.where(ratio < 1.0, DOWN, np.where(ratio < JUMPS, AFTER, ENDS)) * (np.diff(of, prepend=-9) == 0)
     start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
     start[ratio >= 1.0] *= SELDOM
     start[0] = 1.0 - start[1:].sum()
     alone = np.zeros((2, n), int)
     for g, members in enumerate(each):
         alone[:, list(members)] = np.flatnonzero(of == g)[[0, -1], None] + [[0], [1]]
-    return {"ratio": ratio, "ladder": of, "arrive": arrive, "down": down, "start": start, "alone": alone}
+    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "alone": alone}
 
 
 def bank(n: int, groups: Any) -> dict[str, Any]:
@@ -105,7 +103,7 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
     return {
         "modes": K,
         "parameters": n,
-        **{name: modes[name] for name in ("ratio", "arrive", "down", "alone")},
+        **{name: modes[name] for name in ("ratio", "arrive", "alone")},
         "mu": modes["start"],
         "m": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
