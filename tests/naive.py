@@ -5,7 +5,7 @@ from scipy import stats
 
 from driftfit.trackers.mixture import filters
 from driftfit.trackers.mixture import states as of_noise
-from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, OUTLYING
+from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
 
 
 def full(lower):
@@ -14,10 +14,10 @@ def full(lower):
     return np.where(np.tri(len(lower), dtype=bool).reshape(lower.shape[:2] + (1,) * (lower.ndim - 2)), lower, other)
 
 
-def walks(lane, jump=COMMON[-1]):
-    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is the last rung."""
+def walks(lane, jump=JUMPS):
+    """Drift covariances (K, n, n) of the modes in a nominal interval, in units of theta; ``jump`` is that of jumps."""
     n, c = len(lane["c"]), lane["c"]
-    rho = lane["r"] * np.where(lane["ratio"] == COMMON[-1], jump, lane["ratio"])
+    rho = lane["r"] * np.where(lane["ratio"] == JUMPS, jump, lane["ratio"])
     mean, v, away = lane["mean"], lane["variance"], np.eye(n)
     moving = v > filters.STILL * c
     constant = np.flatnonzero(~moving & (mean != 0.0))[-1:]
@@ -41,7 +41,7 @@ def moved_along(lane, time=1.0):
     return m
 
 
-def before(lane, phi, jump=COMMON[-1]):
+def before(lane, phi, jump=JUMPS):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
     S, r = lane["S"], lane["r"]
     C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
@@ -52,22 +52,18 @@ def before(lane, phi, jump=COMMON[-1]):
 def expected(lane, phi):
     """Prediction, and its variance if nothing unusual happens."""
     x, m, C, v = before(lane, phi)
-    jumps = lane["arrive"] * (lane["ratio"] >= 1.0)
-    mean, restless = x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
-    spread = np.maximum(lane["mu"] - jumps, 0.0) @ (np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2)
-    return mean, spread + v[0] ** (1.0 - restless) * v[1] ** restless
+    jump, mean, restless = lane["ratio"] == JUMPS, x @ m @ lane["mu"], states(lane)[1] / (1.0 - states(lane)[2])
+    of = np.einsum("i,kij,j->k", x, C, x) + (x @ m - mean) ** 2
+    usual, wide = (np.average(of[which], weights=lane["mu"][which]) for which in (~jump, jump))
+    noise, p = v[0] ** (1.0 - restless) * v[1] ** restless, lane["mu"][jump].sum()
+    return mean, (noise + usual) ** (1.0 - p) * (noise + wide) ** p
 
 
 def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
-    square = (y - mean) ** 2
-    jump = (
-        min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]
-        if square > COMMON[-1] * variance
-        else 0.0
-    )
-    return before(lane, phi, max(COMMON[-1], jump))
+    square = (y - mean) ** 2 * ((y - mean) ** 2 > of_noise.LARGE * variance)
+    return before(lane, phi, max(JUMPS, min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]))
 
 
 def states(lane):
@@ -109,7 +105,8 @@ def sample(lane, phi, y):
 def interaction(lane, mu, m, C):
     """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
     ratio, arrive = lane["ratio"], lane["arrive"]
-    down = np.where(ratio >= 1.0, of_noise.AFTER, of_noise.DOWN) * np.append(False, np.diff(ratio) > 0.0)
+    down = np.where(ratio < 1.0, of_noise.DOWN, np.where(ratio < JUMPS, of_noise.AFTER, of_noise.ENDS))
+    down *= np.append(False, np.diff(ratio) > 0.0)
     T = np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive
     share = mu[:, None] * T
     prior = share.sum(axis=0)

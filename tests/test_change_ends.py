@@ -42,7 +42,7 @@ def test_one_parameter_that_walks_fast(std, limit):
         ratios.append(np.sqrt(squares(run, theta)[150:].mean() / squares(known, theta)[150:].mean()))
         inside.append(np.mean(np.abs(run.theta - theta)[150:] < 1.96 * run.std[150:]))
     assert np.mean(ratios) < limit
-    assert 0.93 < np.mean(inside) < 0.98
+    assert 0.92 < np.mean(inside) < 0.98
 
 
 @pytest.mark.parametrize("model", [Regression(1), Regression(1, intercept=True), ARX(1, 1, intercept=True)])
@@ -57,8 +57,9 @@ def test_a_jump_of_the_response_to_rare_pulses(model):
             y[t] = lag * y[t - 1] + (gain * u)[t - 1 if lag else t] + 0.1 * rng.normal()
         run = track(model, AdaptiveKalman(), y, u)
         i = 1 if lag else 0
-        assert abs(run.theta[-1, i] - 1.0) < 3.0 * run.std[-1, i]
-        assert run.std[-1, i] < 0.7
+        last = np.flatnonzero(u[:-1])[-1] + i  # until the next pulse another jump may be hidden
+        assert abs(run.theta[last, i] - 1.0) < 3.0 * run.std[last, i]
+        assert run.std[last, i] < 0.5
         path = run.smooth()
         np.testing.assert_allclose(path.theta[[100, -1], i], [5.0, 1.0], atol=0.2)
 

@@ -6,16 +6,16 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
 from driftfit.trackers.mixture.learned import BLOCK, FADE, PHI, PRECISION, WINDOW, E
-from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, A, B, M, table
+from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, JUMPS, A, B, M, table
 
 
-def record(T=400, n=3, seed=0):
+def record(T=400, n=3, seed=0, walk=0.05):
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(T, n)) + np.array([30.0, *np.zeros(n - 1)])
-    theta = np.cumsum(0.05 * rng.normal(size=(T, 1)), axis=0) * np.arange(1.0, n + 1.0) + 1.0
+    theta = np.cumsum(walk * rng.normal(size=(T, 1)), axis=0) * np.arange(1.0, n + 1.0) + 1.0
     theta[T // 2 :, 0] += 2.0
     y = np.sum(u * theta, axis=1) + 5.0 + 0.3 * rng.normal(size=T)
-    y[T // 3] += 6.0
+    y[T // 3] += 30.0
     return y, u
 
 
@@ -33,12 +33,12 @@ def lanes(y, u, model, tracker, at):
 
 @pytest.mark.parametrize("groups", [None, [[0, 2], [1]]])
 def test_a_sample_and_the_interaction_against_matrices(groups):
-    (y, u), model, leaps = record(), Regression(3, intercept=True), []
+    (y, u), model, leaps = record(walk=0.005), Regression(3, intercept=True), []
     for t, (one, two) in lanes(y, u, model, AdaptiveKalman(groups=groups), (40, 133, 134, 200, 201, 399)).items():
         phi, left = two["white"], y[t] - float(two["explained"])  # without the part of the noise that is known
         mu, m, C, joint = naive.sample(one, phi, left)
         assert two["s"] == pytest.approx(naive.expected(one, phi)[1], rel=1e-8)
-        leaps.append((left - naive.expected(one, phi)[0]) ** 2 > COMMON[-1] * two["s"])
+        leaps.append((left - naive.expected(one, phi)[0]) ** 2 > JUMPS * one["r"])
         prior, mean, cov, T = naive.interaction(one, mu, m, C)
         np.testing.assert_allclose(two["mu"], prior, rtol=1e-6, atol=1e-12)
         size = np.sqrt(np.einsum("kii->ik", cov))
@@ -56,10 +56,10 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
 
 def test_the_table_of_modes():
     modes = table(4, None)
-    assert len(modes["ratio"]) == 15 + 3 * 4
+    assert len(modes["ratio"]) == 15 + 4 * 4
     assert modes["start"].sum() == pytest.approx(1.0)
     assert modes["arrive"][modes["ratio"] >= 1.0].sum() == pytest.approx(2e-3)
-    assert modes["alone"].tolist() == [[15, 18, 21, 24], [18, 21, 24, 27]]
+    assert modes["alone"].tolist() == [[15, 19, 23, 27], [19, 23, 27, 31]]
     assert (modes["ratio"][: len(COMMON)] == COMMON).all()
     assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 15
 
@@ -114,8 +114,10 @@ def test_rare_pulses_whose_gain_jumps_twice():
         u = (rng.random(1500) < 0.02) * 1.0
         gain = np.repeat([5.0, 1.0, 4.0], 500)
         run = track(Regression(1), AdaptiveKalman(), gain * u + 0.1 * rng.normal(size=1500), u)
-        assert abs(run.theta[-1, 0] - 4.0) < 4.0 * run.std[-1, 0]
-        assert run.std[-1, 0] < 1.0
+        last = np.flatnonzero(u)[-1]
+        assert abs(run.theta[last, 0] - 4.0) < 4.0 * run.std[last, 0]
+        assert run.std[last, 0] < 0.5
+        assert np.mean(np.abs(run.theta[100:, 0] - gain[100:]) < 5.0 * run.std[100:, 0]) > 0.96  # pulses are rare
 
 
 def test_a_plant_that_rests_first_in_hardly_any_noise():
@@ -128,7 +130,7 @@ def test_a_plant_that_rests_first_in_hardly_any_noise():
             y[t] = 0.8 * y[t - 1] + 0.5 * u[t - 1] + std[t] * rng.normal()
         run = track(ARX(1, 1), AdaptiveKalman(), y, u)
         inside.append(np.abs(run.innovation[45:]) < 1.96 * run.innovation_std[45:])
-    assert 0.92 < np.mean(inside) < 0.98  # was 0.61 to 0.73
+    assert 0.91 < np.mean(inside) < 0.98  # was 0.61 to 0.73
 
 
 @pytest.mark.parametrize("std", [0.15, 0.3, 0.6])

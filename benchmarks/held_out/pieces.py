@@ -107,7 +107,7 @@ PIECES: dict[str, Piece] = {
         ),
     ),
     "single ladders": Piece(lambda modes: modes["ladder"] >= 0),
-    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0, functions=of(BANK, "leap")),
+    "jumps": Piece(lambda modes: modes["ratio"] >= 1.0),
     "common jumps": Piece(lambda modes: (modes["ladder"] == -3) & (modes["ratio"] >= 1.0)),
     "jumps of size 1": Piece(lambda modes: modes["ratio"] == 1.0),
     "largest jumps": Piece(lambda modes: modes["ratio"] > 1.0),
@@ -116,10 +116,8 @@ PIECES: dict[str, Piece] = {
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
     "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, DRIFT = 2e-3, 6e-4\n", "\nJUMP, DRIFT = 2e-3, 1e-9\n"),)),
-    "down the ladders": Piece(edits=((STATES, "\nDOWN, AFTER = 1e-3, 0.05\n", "\nDOWN, AFTER = 0.0, 0.05\n"),)),
-    "jumps of any size": Piece(
-        edits=((BANK, "    unusual = (size > 0.0) &", "    unusual = (size < 0.0) &"),), functions=of(BANK, "leap")
-    ),
+    "down the ladders": Piece(edits=((STATES, "\nDOWN, AFTER, ENDS = 1e-3,", "\nDOWN, AFTER, ENDS = 0.0,"),)),
+    "jumps of any size": Piece(edits=((BANK, "    leaps = (size > 0.0) &", "    leaps = (size != size) &"),)),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
         edits=((BANK, "\nFAR = 9.0\n", "\nFAR = 1e300\n"),), functions=of(LEARNED, "learn_means")

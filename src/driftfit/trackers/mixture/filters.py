@@ -36,10 +36,13 @@ from driftfit.trackers.mixture.states import (
     DIRECTION,
     DOWN,
     DRIFT,
+    ENDS,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
     JUMP,
+    JUMPS,
+    LARGE,
     OUTLYING,
     STATES,
     WEIGHT,
@@ -55,7 +58,7 @@ FADING, BEND = 0.05, 0.1
 """Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
-UNSURE = 4.5
+UNSURE = 3.0
 """The covariance that is reported is that of the mixture times 1 + this over the square root of the number of samples,
 because the probabilities of the filters, and r, are estimates."""
 LEAST = 1e-100
@@ -99,54 +102,33 @@ def walks(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def wander(s: State, size: float, l: int) -> None:
-    """Drift of all filters by ``size`` times their ratios."""
+def wander(s: State, size: float, jump: float, l: int) -> None:
+    """Drift of all filters by ``size`` times their ratios, and by ``jump`` where these are jumps."""
     n = s.parameters[l]
     walks(s, l)
+    for k in range(s.modes[l]):
+        s.row[k, l] = size * s.ratio[k, l] if s.ratio[k, l] < JUMPS else jump
     for a in range(n):
         for b in range(a + 1):
-            moved = size * s.walk[0, a, b, l]
             for k in range(FIRST_LEARNED):
-                s.C[a, b, k, l] += s.ratio[k, l] * moved
-            moved = size * s.walk[1, a, b, l]
+                s.C[a, b, k, l] += s.row[k, l] * s.walk[0, a, b, l]
             for k in range(FIRST_LEARNED, FIRST_ALONE):
-                s.C[a, b, k, l] += s.ratio[k, l] * moved
+                s.C[a, b, k, l] += s.row[k, l] * s.walk[1, a, b, l]
     for i in range(n):
-        own = size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        own = 1.0 / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         for a in range(i + 1 if s.alone[1, i, l] > 0 else 0):
             for b in range(a + 1):
                 moved = own * s.S[a, i, l] * s.S[b, i, l]
                 for k in range(s.alone[0, i, l], s.alone[1, i, l]):
-                    s.C[a, b, k, l] += s.ratio[k, l] * moved
-
-
-@partial(kernel, short=True)
-def leap(s: State, more: float, l: int) -> None:
-    """The last rungs of jumps get ``more`` variance, in units of the drift; so do gain and variance of the sample."""
-    n, k = s.parameters[l], len(COMMON) - 1
-    for a in range(n):
-        total = 0.0
-        for b in range(n):
-            moved = more * s.walk[0, max(a, b), min(a, b), l]
-            s.C[a, b, k, l] += moved if b <= a else 0.0
-            total += moved * s.x[b, l]
-        s.gain[a, k, l] += total
-        s.h_k[k, l] += total * s.x[a, l]
-    for i in range(n):
-        if s.alone[1, i, l] > 0 and s.c[i, l] > 0.0:
-            k, own = s.alone[1, i, l] - 1, more / s.c[i, l]
-            for a in range(i + 1):
-                for b in range(a + 1):
-                    s.C[a, b, k, l] += own * s.S[a, i, l] * s.S[b, i, l]
-                s.gain[a, k, l] += own * s.S[a, i, l] * s.white[i, l]
-            s.h_k[k, l] += own * s.white[i, l] * s.white[i, l]
+                    s.C[a, b, k, l] += s.row[k, l] * moved
 
 
 @kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
     if s.settled[l] > 0 and s.dt[l] > 0.0:
-        wander(s, s.r[l] * s.dt[l] * s.drift[l], l)
+        size = s.r[l] * s.dt[l] * s.drift[l]
+        wander(s, size, JUMPS * size, l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.trend.shape[1]):
             k = len(COMMON) + j
@@ -191,17 +173,23 @@ def innovate(s: State, l: int) -> None:
         s.e_k[k, l] += s.explained[l]
         s.row[k, l] = s.mu[k, l] * s.e_k[k, l]
     mean = sum_of_row(s, l)
-    for k in range(K):  # the band is for samples at which no jump begins
-        p = s.mu[k, l] - (s.arrive[k, l] if s.ratio[k, l] >= 1.0 else 0.0)
-        s.row[k, l] = max(p, 0.0) * (s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2)
-    v = sum_of_row(s, l) + s.vague[l]
-    quiet, restless = variance_in(s, 0, l), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
-    v += quiet * exp(restless * log(variance_in(s, 1, l) / quiet))  # their arithmetic mean is that of rare large noise
+    for k in range(K):
+        s.curve[k, l] = s.h_k[k, l] + (s.e_k[k, l] - mean) ** 2
+        s.row[k, l] = s.mu[k, l] if s.ratio[k, l] >= JUMPS else 0.0
+    jump = sum_of_row(s, l)
+    for k in range(K):
+        s.row[k, l] *= s.curve[k, l]
+    wide = sum_of_row(s, l) / jump
+    for k in range(K):
+        s.row[k, l] = s.mu[k, l] * s.curve[k, l] if s.ratio[k, l] < JUMPS else 0.0
+    usual, restless = sum_of_row(s, l) / (1.0 - jump), s.nu_prior[1, l] / (1.0 - s.nu_prior[OUTLYING, l])
+    # geometric means, because the arithmetic one is that of rare large noise, or of rare jumps
+    noise = variance_in(s, 0, l)
+    noise = noise * exp(restless * log(variance_in(s, 1, l) / noise)) + s.vague[l]
+    v = (noise + usual) * exp(jump * log((noise + wide) / (noise + usual)))
     for k in range(K):
         s.e_k[k, l] = s.y[l] - s.e_k[k, l]
-    s.y_hat[l] = mean
-    s.e[l] = s.y[l] - mean
-    s.s[l] = v
+    s.y_hat[l], s.e[l], s.s[l] = mean, s.y[l] - mean, v
 
 
 @partial(kernel, inline=False)
@@ -249,11 +237,14 @@ def weigh(s: State, more: float, l: int) -> None:
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
     square = s.e[l] * s.e[l] / s.noise[l]
-    size = min(max(s.power[l], s.astray[l]), square) - COMMON[-1] * s.r[l]
-    unusual = (size > 0.0) & (s.e[l] * s.e[l] > COMMON[-1] * s.s[l]) & (s.drift[l] > 0.0)
-    if unusual:
-        leap(s, size * s.dt[l] * s.drift[l], l)
-    if more > 0.0 or unusual:
+    size = min(max(s.power[l], s.astray[l]), square) - JUMPS * s.r[l]
+    leaps = (size > 0.0) & (s.e[l] * s.e[l] > LARGE * s.s[l]) & (s.dt[l] * s.drift[l] > 0.0)
+    if leaps:
+        wander(s, 0.0, size, l)
+        project(s, l)
+        for k in range(K):
+            s.e_k[k, l] = s.y[l] - s.explained[l] - s.e_k[k, l]
+    if leaps or more > 0.0:
         likelihoods(s, s.vague[l] + more, l)
     for k in range(K):
         s.row[k, l] = s.joint[0, k, l] + s.joint[1, k, l] + s.joint[2, k, l]
@@ -324,10 +315,11 @@ def enter_filters(s: State, j: int, l: int) -> None:
 
 @partial(kernel, inline=False)
 def mixture(s: State, l: int) -> None:
-    """Mean d of the filters, and the covariance of theta that is reported; without a sample d keeps its bits."""
+    """Mean d and reported covariance of the filters; without a sample d keeps its bits, and no large jump begins."""
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
+        s.curve[k, l] = s.mu[k, l] if s.ok[l] > 0.0 or s.ratio[k, l] < JUMPS else max(s.mu[k, l] - s.arrive[k, l], 0.0)
     s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
     for i in range(n):
         for k in range(K):
@@ -337,7 +329,7 @@ def mixture(s: State, l: int) -> None:
         for j in range(i + 1):
             for k in range(K):
                 away = (s.m[i, k, l] - s.d[i, l]) * (s.m[j, k, l] - s.d[j, l])
-                s.row[k, l] = s.mu[k, l] * (s.C[i, j, k, l] + away)
+                s.row[k, l] = s.curve[k, l] * (s.C[i, j, k, l] + away)
             s.Z[i, j, l] = sum_of_row(s, l)
             s.P[i, j, l] = s.Z[i, j, l]
     in_units_of_theta(s, l)
@@ -356,12 +348,11 @@ def mix(s: State, l: int) -> None:
     """
     n, K = s.parameters[l], s.modes[l]
     for k in range(K):
-        falls = s.ratio[max(k - 1, 0), l] < s.ratio[k, l]  # the lowest of a ladder stays
-        s.row[k, l] = s.mu[k, l] * (AFTER if s.ratio[k, l] >= 1.0 else DOWN) if falls else 0.0
+        down = ENDS if s.ratio[k, l] >= JUMPS else AFTER if s.ratio[k, l] >= 1.0 else DOWN
+        s.row[k, l] = s.mu[k, l] * down if s.ratio[max(k - 1, 0), l] < s.ratio[k, l] else 0.0  # the lowest stays
     s.row[K, l] = 0.0
     for k in range(K):
-        above = s.row[k + 1, l] if s.ratio[min(k + 1, K - 1), l] > s.ratio[k, l] else 0.0
-        stays = (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
+        above, stays = s.row[k + 1, l], (1.0 - JUMP - DRIFT) * s.mu[k, l] - s.row[k, l]
         s.mu[k, l] = stays + above + s.arrive[k, l]
         s.step[k, l], s.curve[k, l] = stays / s.mu[k, l], above / s.mu[k, l]
     s.row[K, l] = 0.0

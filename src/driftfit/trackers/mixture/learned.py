@@ -52,6 +52,7 @@ from driftfit.trackers.mixture.states import (
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
+    JUMPS,
     OUTLYING,
     SCORE,
     SHIFT,
@@ -67,7 +68,7 @@ from driftfit.trackers.mixture.states import (
     sum_of_row,
 )
 
-BLOCK, WINDOW = 25, 50
+BLOCK, WINDOW = 20, 40
 """Samples between two passes, and samples of a pass."""
 FADE = 0.985
 """Factor of the sums at every pass."""
@@ -424,7 +425,7 @@ def run_again(s: State, l: int) -> None:
             s.C[i, i, k, l] *= LOOSE
     for at in range(s.remembered[l]):
         if at > 0:
-            wander(s, s.samples[at, SINCE, l], l)
+            wander(s, s.samples[at, SINCE, l], JUMPS * s.samples[at, SINCE, l], l)
         start_regressor(s, at, l)
         project(s, l)
         for k in range(K):

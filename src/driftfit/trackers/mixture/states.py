@@ -34,19 +34,20 @@ import numpy as np
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 
-COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
+COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
+JUMPS = max(COMMON)
 TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
-ALONE, GROUP = (0.003, 0.05, 30.0), (1e-3, 1e-2, 0.1, 1.0, 30.0)
-"""Drift ratios of the ladders."""
+ALONE, GROUP = (0.003, 0.05, 1.0, JUMPS), (1e-3, 1e-2, 0.1, 1.0, JUMPS)
+"""Drift ratios of the ladders; that of jumps lasts for a few samples."""
 FLOOR = 0.002
 """Share of the common drift in the learned one."""
 MOST_ALONE = 8
 """Number of parameters up to which each has a ladder of its own."""
 JUMP, DRIFT = 2e-3, 6e-4
 """Probabilities, from the whole bank: into all modes with ratios of 1 and more, and into all others."""
-DOWN, AFTER = 1e-3, 0.05
-"""Probabilities of the next smaller ratio of a ladder, and of that from ratios of 1 and more."""
+DOWN, AFTER, ENDS = 1e-3, 0.05, 0.5
+"""Probabilities of the next smaller ratio of a ladder: of that from ratios of 1 and more, and from jumps."""
 AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
 """Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
 these and those of the other ladders."""
@@ -228,8 +229,12 @@ SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "settled",
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for i in range(s.c.shape[0]):
-        o.white[i, l], o.c[i, l] = s.white[i, l], s.c[i, l]
-        o.mean[i, l], o.variance[i, l] = s.mean[i, l], s.variance[i, l]
+        o.white[i, l], o.mean[i, l], o.variance[i, l], o.c[i, l] = (
+            s.white[i, l],
+            s.mean[i, l],
+            s.variance[i, l],
+            s.c[i, l],
+        )
     o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
     o.explained[l], o.settled[l] = s.explained[l], s.settled[l]
 
