@@ -22,8 +22,8 @@ import numpy as np
 
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import Driver, kernel
-from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
+from driftfit.run.gating import replayed
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")

@@ -38,11 +38,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, Step, kernel, nothing
-from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
-from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs
 from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
@@ -189,25 +186,6 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
         return contradicts  # type: ignore[no-any-return]
 
     return judge  # type: ignore[no-any-return]
-
-
-@lru_cache(maxsize=256)
-def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
-    """`ModelSteps.foreseeing` with the tracker's forecast once more: no time passes, and no reading is taken in."""
-    started, part = tracker.start is not None, whole_record if tracker.reads_model else tracker_part
-    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, tracker.start or tracker))
-
-    @kernel
-    def forecast(s: State, l: int) -> None:
-        ok, observed = s.ok[l], s.observed[l]
-        s.ok[l], s.observed[l] = 0.0, 0.0
-        if started and s.root[l] > 0:
-            first(part(s), l)
-        else:
-            usual(part(s), l)
-        s.ok[l], s.observed[l] = ok, observed
-
-    return model.foreseeing and model.foreseeing(forecast)
 
 
 @lru_cache(maxsize=256)
