@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -20,18 +21,6 @@ SAID: Mapping[int, tuple[str, str]] = {
 """For each reason its label in a summary, and what is said of the samples."""
 KEPT = 16
 """Decisions that a stream keeps, and rows of a printed table at most."""
-
-
-def counts(reason: Array) -> dict[int, int]:
-    """How many samples (T,) there are for each reason but USED."""
-    return {one: count for one in SAID if (count := int(np.count_nonzero(reason == one)))}
-
-
-def remarks(count: Mapping[int, int]) -> tuple[tuple[str, str], ...]:
-    """The lines of a summary: nothing if nothing was left out."""
-    return tuple(
-        (SAID[one][0], f"{k} sample{'s' if k > 1 else ''} {SAID[one][1]}: not used") for one, k in count.items()
-    )
 
 
 def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
@@ -77,7 +66,7 @@ class LeftOut:
     @property
     def counts(self) -> dict[str, int]:
         """How many samples there are for each reason, by the name that summaries use."""
-        return {SAID[code][0]: count for code, count in counts(self.code).items()}
+        return {label: count for code, (label, _) in SAID.items() if (count := int(np.sum(self.code == code)))}
 
     def applied(self, y: Array, noise: Array) -> tuple[Array, Array]:
         """Readings y (T,) and factors of the noise variance (T,) with these decisions: refused readings are NaN, and
@@ -122,4 +111,6 @@ def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[
 def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:
     """The lines on what was left out of a record, or of several together."""
     several = [found] if isinstance(found, LeftOut) else found.values()
-    return remarks(counts(np.concatenate([NONE, *(one.code for one in several)])))
+    total = sum((Counter(one.counts) for one in several), Counter[str]())
+    rows = [(label, total[label], said) for label, said in SAID.values() if total[label]]
+    return tuple((label, f"{count} sample{'s' if count > 1 else ''} {said}: not used") for label, count, said in rows)
