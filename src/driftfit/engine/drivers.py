@@ -42,10 +42,8 @@ ROUNDING = 1e-12
 """A result below this share of the numbers that it was computed from may be rounding: each of a few thousand operations
 adds up to 2^-53 of its terms, and decimal readings carry as much."""
 
-
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""
-
 
 NOWHERE = np.empty((0, 0, 0))
 """The array for theta alone, where all results are kept."""

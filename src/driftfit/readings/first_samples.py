@@ -144,30 +144,20 @@ def rotate_in(s: State, k: int, l: int) -> float:
 
 
 @partial(kernel, short=True)
-def fit(s: State, every: bool, l: int) -> float:
-    """Sum of squares of least squares on all rows, or on those that are not doubtful."""
-    N, n = s.gate_first.shape[0], s.phi.shape[0]
-    for i in range(n + 1):
-        for j in range(n + 1):
-            s.gate_fit[i, j, l] = 0.0
-    left = 0.0
-    for k in range(N):
-        if (s.gate_first[k, Y, l] == s.gate_first[k, Y, l]) & (every | (s.gate_doubt[k, l] == 0.0)):
-            left += rotate_in(s, k, l)
-    return left
-
-
-@kernel
 def contradicted(s: State, l: int) -> bool:
-    """Whether the samples that are not doubtful contradict those that are."""
-    rows, some, total = 0, 0, 0.0
-    for k in range(s.gate_first.shape[0]):
-        sure, y = s.gate_doubt[k, l] == 0.0, s.gate_first[k, Y, l]
-        if y == y:
-            rows, some = rows + (1 if sure else 0), some + (0 if sure else 1)
-            total += y**2 if sure else 0.0
-    alone, spare = fit(s, False, l), rows - s.phi.shape[0]
-    more = fit(s, True, l) - alone
+    """Whether the samples that are not doubtful, which come first into the triangle, contradict those that are."""
+    for i in range(s.gate_fit.shape[0]):
+        for j in range(s.gate_fit.shape[0]):
+            s.gate_fit[i, j, l] = 0.0
+    spare, some, alone, more, total = -s.phi.shape[0], 0, 0.0, 0.0, 0.0
+    for turn in range(2):
+        for k in range(s.gate_first.shape[0]):
+            sure, y = turn == 0, s.gate_first[k, Y, l]
+            if (y == y) & (sure == (s.gate_doubt[k, l] == 0.0)):
+                square = rotate_in(s, k, l)
+                spare, some = spare + (1 if sure else 0), some + (0 if sure else 1)
+                alone, more = alone + (square if sure else 0.0), more + (0.0 if sure else square)
+                total += y**2 if sure else 0.0
     return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
