@@ -97,22 +97,16 @@ def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> fl
 
 
 @kernel
-def reach(s: State, column: int, center: float, l: int) -> float:
-    """The distance from center beyond which a value is outlying."""
-    return OUTLYING * usual_value(s, column, center, True, l)  # type: ignore[no-any-return]
-
-
-@kernel
 def doubt(s: State, implicit: bool, l: int) -> bool:
     """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0; whether there is such a one."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, some = reach(s, READING, center, l), False
+    most, some = OUTLYING * usual_value(s, READING, center, True, l), False
     for k in range(N):
         s.gate_doubt[k, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
         center = usual_value(s, PHI + i, 0.0, False, l)
-        most = reach(s, PHI + i, center, l)
+        most = OUTLYING * usual_value(s, PHI + i, center, True, l)
         for k in range(N):
             x, d = s.gate_first[k, PHI + i, l], s.gate_doubt[k, l]
             same = (implicit | (abs(x) == abs(s.gate_first[k, READING, l]))) & (d == 1.0)
@@ -170,7 +164,7 @@ def mark(s: State, ages: int, l: int) -> None:
     bit = 2.0
     for j in range(PHI - U):
         center = usual_value(s, U + j, 0.0, False, l)
-        most = reach(s, U + j, center, l)
+        most = OUTLYING * usual_value(s, U + j, center, True, l)
         for k in range(N):
             hit = 0.0
             for later in range(k, min(k + ages + 1, N)):
@@ -223,15 +217,6 @@ def repeats(s: State, k: int, l: int) -> bool:
 
 
 @kernel
-def drop_oldest(s: State, l: int) -> None:
-    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    for k in range(1, N):
-        for column in range(PHI + n):
-            s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-    s.gate_kept[l] = N - 1
-
-
-@kernel
 def keep(s: State, k: int, times: float, l: int) -> None:
     n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     s.gate_first[k, Y, l] = s.y[l] if s.ok[l] > 0.0 else np.nan
@@ -254,7 +239,10 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     if s.gate_kept[l] == N:
         known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
         s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
-        drop_oldest(s, l)
+        for k in range(1, N):  # the oldest makes room
+            for column in range(s.gate_first.shape[1]):
+                s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
+        s.gate_kept[l] = N - 1
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
     known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]

@@ -40,18 +40,6 @@ def widen(s: State, j: int, u: float, l: int) -> None:
     s.gate_low[j, l], s.gate_high[j, l] = min(s.gate_low[j, l], u), max(s.gate_high[j, l], u)
 
 
-@kernel
-def notice_one(s: State, j: int, away: float, l: int) -> None:
-    """Set the bit of the present sample if the input is outside its range, which takes it in otherwise."""
-    u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
-    if abs(u) < np.inf:
-        if abs(2.0 * u - (low + high)) > away * (high - low):
-            s.gate_strange[j, l] = u
-            s.gate_outside[j, l] |= 1
-        else:
-            widen(s, j, u, l)
-
-
 def input_rules(
     gate: Any, ages: int, refuse: Callable[[State, int, int, int], None]
 ) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
@@ -68,8 +56,13 @@ def input_rules(
             if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
                 widen(s, j, s.gate_strange[j, l], l)
                 s.gate_outside[j, l] = 0
-            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) & all_ages
-            notice_one(s, j, away if known else np.inf, l)
+            u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
+            strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
+            s.gate_outside[j, l] = ((s.gate_outside[j, l] << 1) & all_ages) | (1 if strange else 0)
+            if strange:
+                s.gate_strange[j, l] = u
+            elif abs(u) < np.inf:
+                widen(s, j, u, l)
 
     @kernel
     def take_out(s: State, j: int, l: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED, SIGNAL
+from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED
 
 SAID: Mapping[int, tuple[str, str]] = {
     REFUSED: ("Left out", "far outside the range of the others, which the model did not predict"),
@@ -21,13 +21,6 @@ SAID: Mapping[int, tuple[str, str]] = {
 """For each reason its label in a summary, and what is said of the samples."""
 KEPT = 16
 """Decisions that a stream keeps, and rows of a printed table at most."""
-
-
-def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
-    """The line on a coarse meter, given the floor of the noise variance: nothing if there is none."""
-    step = np.sqrt(12.0 * floor)
-    said = f"steps of {step:.4g}: the noise variance is taken to be at least {floor:.3g}"
-    return (("Resolution", said),) if floor > 0.0 else ()
 
 
 class Decision(NamedTuple):
@@ -94,18 +87,6 @@ def table(decisions: Sequence[Decision]) -> str:
 
 NONE = np.empty(0, int)
 NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE)
-
-
-def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
-    """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
-    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
-    sample = np.flatnonzero(decided)
-    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
-    refused = sample[signal == 0]
-    after = (sample[:, None] + np.arange(ages + 1)).ravel()
-    after = np.setdiff1d(after[after < len(y)], refused)
-    unused = after[~ok[after] & np.isfinite(y[after])]
-    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
 def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:

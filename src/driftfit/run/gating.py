@@ -1,8 +1,8 @@
-"""Which gate stands before a tracker, and what it found among the first samples."""
+"""Which gate stands before a tracker, and what it left out of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -15,7 +15,8 @@ from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.engine.phases import forecasting
 from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES, U
-from driftfit.readings.gate import Gate
+from driftfit.readings.gate import SIGNAL, Gate
+from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
 
 
@@ -45,6 +46,18 @@ def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
         s.ok[l], s.observed[l] = ok, observed
 
     return model.foreseeing and model.foreseeing(forecast)
+
+
+def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
+    """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
+    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
+    sample = np.flatnonzero(decided)
+    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
+    refused = sample[signal == 0]
+    after = (sample[:, None] + np.arange(ages + 1)).ravel()
+    after = np.setdiff1d(after[after < len(y)], refused)
+    unused = after[~ok[after] & np.isfinite(y[after])]
+    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
 def without_start(gate: Gate | None) -> Gate | None:

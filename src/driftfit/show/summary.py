@@ -28,7 +28,7 @@ from driftfit.judge.compare import Comparison, compare, left_at_start, persisten
 from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
-from driftfit.readings.left_out import floor_remark, remarks_of
+from driftfit.readings.left_out import remarks_of
 from driftfit.run.fleet import KeyedResults, Outputs
 from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track, burn_in, root_mean_square
@@ -175,6 +175,13 @@ def _signals(labels: Labels) -> str:
     """Names of the signals with their units."""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
+
+
+def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
+    """The line on a coarse meter, given the floor of the noise variance: nothing if there is none."""
+    step = np.sqrt(12.0 * floor)
+    said = f"steps of {step:.4g}: the noise variance is taken to be at least {floor:.3g}"
+    return (("Resolution", said),) if floor > 0.0 else ()
 
 
 def _gate(run: Track) -> tuple[tuple[str, str], ...]:
