@@ -7,7 +7,7 @@ the middle of the range of its earlier values. It is blamed if it is in the mode
 
 A large input to which the output responds is never blamed: a step of a set point, a flood, a rare pulse. A blamed input
 is missing from the model's memory, and the sample is not used. After `Gate.trust` samples in a row inputs are believed.
-The last value that leaves the memory without blame, or stays there when trust is spent, widens the range.
+What leaves the memory without blame, or stays there when trust is spent, widens the range.
 
 Source: ours. Cost per sample: a few operations for each input.
 """
@@ -26,12 +26,18 @@ LONGEST = 60
 
 
 def no_inputs(m: int) -> Mapping[str, Any]:
-    """Fields before the first sample: ranges, the last value outside, a bit for each sample that is outside."""
-    every = np.ones(max(m, 1))
+    """Fields before the first sample: ranges, what would widen them, a bit for each sample that is outside."""
+    low, high = np.full(max(m, 1), np.inf), np.full(max(m, 1), -np.inf)
     return {
-        "gate_low": np.inf * every, "gate_high": -np.inf * every, "gate_strange": 0.0 * every,
+        "gate_low": low, "gate_high": high, "gate_lowest": low, "gate_highest": high,
         "gate_outside": np.zeros(max(m, 1), np.int64), "gate_blamed": 0,
     }  # fmt: skip
+
+
+@kernel
+def forget(s: State, j: int, l: int) -> None:
+    """Nothing is outside any more."""
+    s.gate_outside[j, l], s.gate_lowest[j, l], s.gate_highest[j, l] = 0, np.inf, -np.inf
 
 
 @kernel
@@ -54,13 +60,14 @@ def input_rules(
     def notice(s: State, known: bool, l: int) -> None:
         for j in range(s.gate_low.shape[0]):
             if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
-                widen(s, j, s.gate_strange[j, l], l)
-                s.gate_outside[j, l] = 0
+                widen(s, j, s.gate_lowest[j, l], l)
+                widen(s, j, s.gate_highest[j, l], l)
+                forget(s, j, l)
             u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
             strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
             s.gate_outside[j, l] = ((s.gate_outside[j, l] << 1) & all_ages) | (1 if strange else 0)
             if strange:
-                s.gate_strange[j, l] = u
+                s.gate_lowest[j, l], s.gate_highest[j, l] = min(s.gate_lowest[j, l], u), max(s.gate_highest[j, l], u)
             elif abs(u) < np.inf:
                 widen(s, j, u, l)
 
@@ -69,7 +76,7 @@ def input_rules(
         for age in range(ages, -1, -1):
             if (s.gate_outside[j, l] >> age) & 1 > 0:
                 refuse(s, j, age, l)
-        s.gate_outside[j, l] = 0
+        forget(s, j, l)
 
     @kernel
     def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
