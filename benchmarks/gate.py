@@ -282,9 +282,9 @@ def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show
 
 
 RULES = {
-    "outputs": {"far": np.inf}, "repeats": {"hold": 3}, "repeats by nature": {"natural": np.inf},
+    "outputs": {"far": np.inf}, "repeats": {"hold": 3},
     "unusual forecasts": {"rare": np.inf}, "inputs": {"away": np.inf}, "six samples": {"trust": 50},
-    "frozen": {"frozen": 0.0}, "coarse": {"coarse": np.inf}, "first samples": {"first": 0},
+    "frozen": {"frozen": 0.0}, "first samples": {"first": 0},
 }  # fmt: skip
 
 

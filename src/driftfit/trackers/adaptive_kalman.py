@@ -45,6 +45,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
+from driftfit.readings.repeats import resolve
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
     FRAME,
@@ -91,7 +92,6 @@ from driftfit.trackers.mixture.states import (
     learn_noise,
     least_noise,
     noise_prior,
-    note_reading,
     repeated_rounding,
     store_for_smoother,
 )
@@ -146,7 +146,6 @@ def look_ahead(s: State, entering: int, l: int) -> None:
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
     s.outlier[l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
-    note_reading(s, l)
     column = s.column[l]
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
@@ -283,7 +282,6 @@ class AdaptiveKalman(Tracker):
             "waited": 0.0,
             "settled": 0,
             "column": -1,
-            "shift": 0.0,
             "vague": 0.0,
             **knowing_nothing(n),
             **no_excitation(n),
@@ -309,6 +307,7 @@ class AdaptiveKalman(Tracker):
             machines=(*FRAME, machine_drift),
             doubts=True,
             outlined=True,
+            note=resolve,
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:

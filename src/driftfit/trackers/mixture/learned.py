@@ -62,7 +62,6 @@ from driftfit.trackers.mixture.states import (
     N,
     T,
     V,
-    note_reading,
     sum_of_row,
 )
 
@@ -414,12 +413,11 @@ def forecast_start(s: State, l: int) -> None:
 def take_start(s: State, l: int) -> None:
     """A sample of least squares, and its residual if the reading did not repeat the one before."""
     s.waited[l] += s.dt[l] * s.drift[l]
-    note_reading(s, l)
     learn_scales(s, l)
     learn_means(s, l)
     learn_information(s, s.noise[l], l)
     absorb_on_roots(s, l)
-    if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
+    if (s.h[l] < math.inf) & (s.alike[l] < 1.0):
         s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])
         s.count[l] += s.ok[l]
         s.scale[l] = s.squares[l] / s.count[l]  # NaN until there is a residual
