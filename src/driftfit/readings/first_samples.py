@@ -60,10 +60,6 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-SCRATCH = "gate_fit", "gate_doubt", "raw_y"
-"""Fields that carry nothing from one sample to the next."""
-
-
 @kernel
 def reading_now(s: State, l: int) -> float:
     """The reading as it was measured, which a model may have replaced by a function of it; NaN if it is missing."""

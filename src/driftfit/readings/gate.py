@@ -103,11 +103,7 @@ def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
 
 def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, float, int], None]:
     """``learn(s, seen, contradicts, own, v, l)``: mean and variance of the readings, the mean of e^2 / own of the
-    samples used, and the error of a settled tracker, which is compared with v.
-
-    A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
-    ever, more of them are usual in the end.
-    """
+    samples used, and the error of a settled tracker, which is compared with v."""
 
     @kernel
     def learn(s: State, seen: bool, contradicts: bool, own: float, v: float, l: int) -> None:

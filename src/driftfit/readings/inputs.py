@@ -51,8 +51,7 @@ def input_rules(
 ) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
     """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, the
     number of the first input that is blamed for it, from 1, or 0, of a model that remembers the inputs of ``ages``
-    samples besides the present.
-    """
+    samples besides the present."""
     away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
     all_ages = (1 << (ages + 1)) - 1
 
@@ -72,13 +71,6 @@ def input_rules(
                 widen(s, j, u, l)
 
     @kernel
-    def take_out(s: State, j: int, l: int) -> None:
-        for age in range(ages, -1, -1):
-            if (s.gate_outside[j, l] >> age) & 1 > 0:
-                refuse(s, j, age, l)
-        forget(s, j, l)
-
-    @kernel
     def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
         first = 0
         for j in range(s.gate_low.shape[0] - 1, -1, -1):
@@ -90,7 +82,10 @@ def input_rules(
             return 0
         s.gate_blamed[l] += 1
         for j in range(s.gate_low.shape[0]):
-            take_out(s, j, l)
+            for age in range(ages, -1, -1):
+                if (s.gate_outside[j, l] >> age) & 1 > 0:
+                    refuse(s, j, age, l)
+            forget(s, j, l)
         return first
 
     return notice, blame

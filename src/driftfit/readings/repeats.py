@@ -31,7 +31,7 @@ few comparisons.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -51,13 +51,14 @@ BELIEVED = -1.0
 """In place of the probability that a sensor is frozen, until the reading changes: it is a level that repeats."""
 
 
-def unresolved() -> Mapping[str, Any]:
-    """Fields of `resolve` before the first reading: the last one and how often it has come again, the smallest step and
-    how many have its size, and how many steps and repeats there were."""
-    return {
-        "reading": np.nan, "alike": 0.0, "finest": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "floor": 0.0,
-        "shift": 0.0,
-    }  # fmt: skip
+def unread() -> dict[str, Any]:
+    """Fields of `note_reading`: the last one, how often it has come again, the smallest step, and the shift of y."""
+    return {"reading": np.nan, "alike": 0.0, "finest": np.inf, "shift": 0.0}
+
+
+def unresolved() -> dict[str, Any]:
+    """Fields of `resolve`: how many steps have the size of the smallest, how many steps and repeats there were."""
+    return {**unread(), "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "floor": 0.0}
 
 
 @kernel
@@ -81,19 +82,27 @@ def natural(s: State, l: int) -> bool:
 
 
 @kernel
+def note_reading(s: State, l: int) -> None:
+    """Whether a reading repeats the last one, and the smallest step."""
+    if s.observed[l] > 0.0:
+        step, repeated = abs(measured(s, l) - s.reading[l]), repeats_last(s, l)
+        s.alike[l] = s.alike[l] + 1.0 if repeated else 0.0
+        s.finest[l] = step if (not repeated) & (step < s.finest[l]) else s.finest[l]  # NaN at the first reading
+        s.reading[l] = measured(s, l)
+
+
+@kernel
 def resolve(s: State, l: int) -> None:
     """Learn from a reading that was accepted, and set the floor."""
+    step, finest = abs(measured(s, l) - s.reading[l]), s.finest[l]
+    note_reading(s, l)
     if s.observed[l] > 0.0:
-        step, finest = abs(measured(s, l) - s.reading[l]), s.finest[l]
-        repeated = 1.0 if repeats_last(s, l) else 0.0
-        s.alike[l] = repeated * (s.alike[l] + 1.0)
-        s.repeats[l] += repeated
-        if (repeated == 0.0) & (step > 0.0):  # NaN at the first reading
+        if s.alike[l] > 0.0:
+            s.repeats[l] += 1.0
+        elif step > 0.0:
             s.steps[l] += 1.0
             kept = s.smallest[l] if step >= 0.75 * finest else 0.0
             s.smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
-            s.finest[l] = min(step, finest)
-        s.reading[l] = measured(s, l)
         coarse = natural(s, l) & (s.smallest[l] >= max(ENOUGH, SHARE * s.steps[l]))
         s.floor[l] = s.finest[l] * s.finest[l] / 12.0 if coarse else 0.0
 

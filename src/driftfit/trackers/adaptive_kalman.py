@@ -45,7 +45,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
-from driftfit.readings.repeats import resolve
+from driftfit.readings.repeats import note_reading
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
     FRAME,
@@ -307,7 +307,7 @@ class AdaptiveKalman(Tracker):
             machines=(*FRAME, machine_drift),
             doubts=True,
             outlined=True,
-            note=resolve,
+            note=note_reading,
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
-from driftfit.readings.repeats import unresolved
+from driftfit.readings.repeats import unread
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 TREND = (1e-3, 1e-2, 0.1)
@@ -129,7 +129,7 @@ def any_noise() -> dict[str, Any]:
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.zeros(STATES), "restless": 1.0, "outlier": 0.0,
         "precision": 0.0, "usual_noise": 1.0, "outlying": OUTLIER, "astray": 0.0,
-        **unresolved(),
+        **unread(),
     }  # fmt: skip
 
 
