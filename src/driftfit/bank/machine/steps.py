@@ -54,6 +54,8 @@ from driftfit.trackers.student import RESIDUALS, wider
 
 BASES = len(BASE_NAMES)
 GIVEN, GIVEN_CHAIN, DRIFT, LAG_ROWS = (ROW[name] for name in ("given", "given_chain", "drift", "lag_rows"))
+LONGEST = 4.0
+"""At most so many repeated readings in a row count."""
 
 
 @kernel
@@ -132,9 +134,8 @@ def run(s: State, l: int) -> None:
 
 @kernel
 def repeated(s: State, l: int) -> float:
-    """The factor of the noise variance for a repeated reading of a coarse meter, in units of that of the innovation."""
-    known = s.floor[l] > 0.0 and s.s[l] < np.inf
-    return 1.0 + s.alike[l] * s.floor[l] / max(s.floor[l], s.s[l]) if known else 1.0
+    """The factor of the noise variance for a repeated reading of a coarse meter, which shares its error of rounding."""
+    return 1.0 + min(s.alike[l], LONGEST) if s.floor[l] > 0.0 else 1.0
 
 
 @kernel
