@@ -22,8 +22,8 @@ import numpy as np
 
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import Driver, kernel
-from driftfit.readings.first_samples import replayed
 from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
+from driftfit.run.gating import replayed
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")
@@ -282,9 +282,9 @@ def table(benches: dict[str, Bench], cases: dict[str, Callable], runs: int, show
 
 
 RULES = {
-    "outputs": {"far": np.inf}, "repeats": {"hold": 3}, "repeats by nature": {"natural": np.inf},
+    "outputs": {"far": np.inf}, "repeats": {"hold": 3},
     "unusual forecasts": {"rare": np.inf}, "inputs": {"away": np.inf}, "six samples": {"trust": 50},
-    "frozen": {"frozen": 0.0}, "coarse": {"coarse": np.inf}, "first samples": {"first": 0},
+    "frozen": {"frozen": 0.0}, "first samples": {"first": 0},
 }  # fmt: skip
 
 

@@ -57,11 +57,11 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, vector
 from driftfit.models.base import Model
+from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing, take_root
 from driftfit.trackers.forms.excitation import not_learned, window
 from driftfit.trackers.forms.information import triangular_root
-from driftfit.trackers.forms.resolution import resolution, unresolved
 
 
 @dataclass(frozen=True)
@@ -390,7 +390,7 @@ class Bank(Tracker):
             facts.append(("Impossible", f"{count} samples that every hypothesis ruled out, left unused"))
         if (never := np.isinf(lane["var"])).any():
             facts.append(not_learned(run, np.array(run.names)[never]))
-        return (*facts, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+        return tuple(facts)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta the regressors have distinguished so far, (n,) bool."""

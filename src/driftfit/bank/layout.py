@@ -80,7 +80,7 @@ SAMPLE = _Sample(*range(23))
 """Numbers of the present sample: inputs and results. ``most`` is the largest mean square that a leaf's own prediction
 may have in its output lags (`leaves.lags`), ``least`` the smallest noise variance. Before the tree grows ``freedom`` is
 that of an estimated noise variance, inf for one that is given. ``reading`` is y + ``shift`` of the last accepted sample
-(`driftfit.trackers.forms.resolution`), ``last`` the same minus the present shift. ``unit`` is the mean unit of
+(`driftfit.readings.repeats`), ``last`` the same minus the present shift. ``unit`` is the mean unit of
 the covariances of leaves: 1, or the noise variance where it is unknown.
 """
 NEVER = 1e9

@@ -42,10 +42,8 @@ ROUNDING = 1e-12
 """A result below this share of the numbers that it was computed from may be rounding: each of a few thousand operations
 adds up to 2^-53 of its terms, and decimal readings carry as much."""
 
-
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""
-
 
 NOWHERE = np.empty((0, 0, 0))
 """The array for theta alone, where all results are kept."""
@@ -177,7 +175,7 @@ class TrackerSteps(NamedTuple):
     (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
     compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that a
     call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the tracker
-    estimates, which a gate keeps above that of rounding. ``note`` comes first and may write what they change later.
+    estimates, which a gate keeps above that of rounding. ``note`` stands in the place of a gate.
     """
 
     predict: Step
@@ -333,7 +331,7 @@ def _written(common: bool, store: Any, keep_more: Any, part: Any) -> Any:
 def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record. Between the regression and the lags
     are the ``phases`` of the tracker, one or two, and the gate after the first."""
-    regress, push, notes, judged = model.regress, model.push, note is not nothing, judge is not None
+    regress, push, notes, judged = model.regress, model.push, note is not nothing and judge is None, judge is not None
     first, last, two = phases[0], phases[-1], len(phases) > 1
 
     @kernel
@@ -344,13 +342,14 @@ def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, 
                 s.raw_y[l] = s.y[l]
             regress(s, l)
             clean(tracker_part(s), l)
-            if notes:  # a constant
-                note(part(s), l)
-        first(part(s))
+        if two:  # a constant
+            first(part(s))
         if judged:
             judge(s)
-        if two:  # a constant
-            last(part(s))
+        if notes:  # a constant
+            for l in range(L):
+                note(part(s), l)
+        last(part(s))
         for l in range(L):
             push(s, l)
         for l in range(L):

@@ -28,11 +28,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.kernel import State, Step, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
@@ -44,11 +44,11 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
-Y, READING, DT, NOISE, DRIFT, TIMES, DOUBT, U = range(8)
+Y, READING, DT, NOISE, DRIFT, TIMES, U = range(7)
 CODES = Y
 """Columns of a kept sample: output (NaN if it cannot be used) and reading (NaN if missing), intervals since the last
-sample, factors of noise and drift, how often it came, the judgement, and the first input. The regressor follows the
-inputs. When it is decided, which signals are codes takes the place of the output."""
+sample, factors of noise and drift, how often it came, and the first input. The regressor follows the inputs. When it is
+decided, which signals are codes takes the place of the output."""
 
 
 def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
@@ -56,7 +56,7 @@ def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
     N = first + n if first > 0 else 1
     return {
         "gate_first": np.full((N, U + m + n), np.nan), "gate_kept": 0, "gate_decided": 0 if first > 0 else 1,
-        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)), "raw_y": np.nan,
+        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)), "gate_doubt": np.zeros(N), "raw_y": np.nan,
     }  # fmt: skip
 
 
@@ -93,30 +93,24 @@ def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> fl
 
 
 @kernel
-def reach(s: State, column: int, center: float, l: int) -> float:
-    """The distance from center beyond which a value is outlying."""
-    return OUTLYING * usual_value(s, column, center, True, l)  # type: ignore[no-any-return]
-
-
-@kernel
 def doubt(s: State, implicit: bool, l: int) -> bool:
-    """Write into each sample 1 if its reading is outlying, 2 if a regressor is; whether one has one of the two."""
+    """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0; whether there is such a one."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, some = reach(s, READING, center, l), False
+    most, some = OUTLYING * usual_value(s, READING, center, True, l), False
     for k in range(N):
-        s.gate_first[k, DOUBT, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
+        s.gate_doubt[k, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
         center = usual_value(s, PHI + i, 0.0, False, l)
-        most = reach(s, PHI + i, center, l)
+        most = OUTLYING * usual_value(s, PHI + i, center, True, l)
         for k in range(N):
-            x, d = s.gate_first[k, PHI + i, l], s.gate_first[k, DOUBT, l]
+            x, d = s.gate_first[k, PHI + i, l], s.gate_doubt[k, l]
             same = (implicit | (abs(x) == abs(s.gate_first[k, READING, l]))) & (d == 1.0)
             if (abs(x - center) > most) & (d < 2.0) & (not same):
-                s.gate_first[k, DOUBT, l] = d + 2.0
+                s.gate_doubt[k, l] = d + 2.0
     for k in range(N):
-        d = s.gate_first[k, DOUBT, l]
-        some |= (d == 1.0) | (d == 2.0)
+        s.gate_doubt[k, l] = s.gate_doubt[k, l] if s.gate_doubt[k, l] < 3.0 else 0.0
+        some |= s.gate_doubt[k, l] > 0.0
     return some
 
 
@@ -140,32 +134,20 @@ def rotate_in(s: State, k: int, l: int) -> float:
 
 
 @partial(kernel, short=True)
-def fit(s: State, every: bool, l: int) -> float:
-    """Sum of squares of least squares on all rows, or on those that are not doubtful."""
-    N, n = s.gate_first.shape[0], s.phi.shape[0]
-    for i in range(n + 1):
-        for j in range(n + 1):
-            s.gate_fit[i, j, l] = 0.0
-    left = 0.0
-    for k in range(N):
-        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
-        if (y == y) & (every | (d == 0.0) | (d == 3.0)):
-            left += rotate_in(s, k, l)
-    return left
-
-
-@kernel
 def contradicted(s: State, l: int) -> bool:
-    """Whether the samples that are not doubtful contradict those that are."""
-    rows, some, total = 0, 0, 0.0
-    for k in range(s.gate_first.shape[0]):
-        d, y = s.gate_first[k, DOUBT, l], s.gate_first[k, Y, l]
-        if y == y:
-            sure = (d == 0.0) | (d == 3.0)
-            rows, some = rows + (1 if sure else 0), some + (0 if sure else 1)
-            total += y**2 if sure else 0.0
-    alone, spare = fit(s, False, l), rows - s.phi.shape[0]
-    more = fit(s, True, l) - alone
+    """Whether the samples that are not doubtful, which come first into the triangle, contradict those that are."""
+    for i in range(s.gate_fit.shape[0]):
+        for j in range(s.gate_fit.shape[0]):
+            s.gate_fit[i, j, l] = 0.0
+    spare, some, alone, more, total = -s.phi.shape[0], 0, 0.0, 0.0, 0.0
+    for turn in range(2):
+        for k in range(s.gate_first.shape[0]):
+            sure, y = turn == 0, s.gate_first[k, Y, l]
+            if (y == y) & (sure == (s.gate_doubt[k, l] == 0.0)):
+                square = rotate_in(s, k, l)
+                spare, some = spare + (1 if sure else 0), some + (0 if sure else 1)
+                alone, more = alone + (square if sure else 0.0), more + (0.0 if sure else square)
+                total += y**2 if sure else 0.0
     return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
@@ -174,15 +156,15 @@ def mark(s: State, ages: int, l: int) -> None:
     """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
     N, PHI = s.gate_first.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     for k in range(N):
-        s.gate_first[k, CODES, l] = 1.0 if s.gate_first[k, DOUBT, l] == 1.0 else 0.0
+        s.gate_first[k, CODES, l] = 1.0 if s.gate_doubt[k, l] == 1.0 else 0.0
     bit = 2.0
     for j in range(PHI - U):
         center = usual_value(s, U + j, 0.0, False, l)
-        most = reach(s, U + j, center, l)
+        most = OUTLYING * usual_value(s, U + j, center, True, l)
         for k in range(N):
             hit = 0.0
             for later in range(k, min(k + ages + 1, N)):
-                hit = bit if s.gate_first[later, DOUBT, l] == 2.0 else hit
+                hit = bit if s.gate_doubt[later, l] == 2.0 else hit
             outside = abs(s.gate_first[k, U + j, l] - center) > most
             s.gate_first[k, CODES, l] += hit if outside else 0.0
         bit *= 2.0
@@ -211,7 +193,7 @@ def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     dropped, s.gate_decided[l] = -s.gate_decided[l], 1
     some = doubt(s, implicit, l)
-    whole = (dropped == 0) | (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
+    whole = (dropped == 0) | (s.gate_doubt[0, l] == 1.0) & (not comes_again(s, l))
     if some & whole and contradicted(s, l):
         mark(s, ages, l)
         s.gate_replay[l] = 1 + dropped
@@ -228,15 +210,6 @@ def repeats(s: State, k: int, l: int) -> bool:
     for i in range(n):
         same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
     return same  # type: ignore[no-any-return]
-
-
-@kernel
-def drop_oldest(s: State, l: int) -> None:
-    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    for k in range(1, N):
-        for column in range(PHI + n):
-            s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-    s.gate_kept[l] = N - 1
 
 
 @kernel
@@ -262,7 +235,10 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     if s.gate_kept[l] == N:
         known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
         s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
-        drop_oldest(s, l)
+        for k in range(1, N):  # the oldest makes room
+            for column in range(s.gate_first.shape[1]):
+                s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
+        s.gate_kept[l] = N - 1
     keep(s, s.gate_kept[l], 1.0, l)
     s.gate_kept[l] += 1
     known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
@@ -280,32 +256,3 @@ def first_samples(ages: int, implicit: bool = False) -> Step:
             remember_one(s, ages, implicit, l)
 
     return remember  # type: ignore[no-any-return]
-
-
-class First(NamedTuple):
-    """The first samples, each as often as it came, up to the present one."""
-
-    y: Array
-    """Readings (k,)."""
-    u: Array
-    """Inputs (k, m); of samples that made room for others NaN."""
-    known: Array
-    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
-    codes: Array
-    """Which signals (k, 1 + m), the output first, are codes."""
-    reason: Array
-    """What was decided (k,), as a gate stores it."""
-
-    def without_codes(self) -> tuple[Array, Array]:
-        """(readings (k,), inputs (k, m)), NaN where they are codes."""
-        return np.where(self.codes[:, 0], np.nan, self.y), np.where(self.codes[:, 1:], np.nan, self.u)
-
-
-def replayed(lane: Mapping[str, Array], m: int) -> First:
-    """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
-    rows, dropped = np.array(lane["gate_first"][: int(lane["gate_kept"])]), int(lane["gate_replay"]) - 1
-    rows[0, TIMES] += dropped
-    rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
-    rows[:dropped, U : U + m] = np.nan
-    codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
-    return First(rows[:, READING], rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros(len(rows)))

@@ -38,14 +38,11 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, Step, kernel, nothing
-from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
-from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs
-from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
+from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unresolved
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
@@ -70,30 +67,26 @@ class Gate(Settings):
 
     ``far``: usual deviations of the readings, and ``sure``: deviations of the forecast, beyond which a reading is far
     (inf: no reading). ``believed``: samples in a row that are a change. ``hold``: repeats in all digits until a code is
-    taken for a level (``believed``: repeats are as good as others). ``natural``: share of repeats from which they are
-    no sign of a code (inf). ``rare``: usual deviations beyond which a forecast is unusual (inf). ``away``: half ranges
-    from the middle of its range beyond which an input is strange (inf). ``trust``: how many samples in a row are blamed
-    on inputs. ``frozen``: probability per reading that a sensor freezes (0). ``coarse``: share of repeats and
-    of smallest steps of a coarse meter (inf). ``first``: samples judged together at the start, besides one for each
-    parameter (0).
+    taken for a level (``believed``: repeats are as good as others). ``rare``: usual deviations beyond which a forecast
+    is unusual (inf). ``away``: half ranges from the middle of its range beyond which an input is strange (inf).
+    ``trust``: how many samples in a row are blamed on inputs. ``frozen``: probability per reading that a sensor freezes
+    (0). ``first``: samples judged together at the start, besides one for each parameter (0).
     """
 
     far: float = 10.0
     sure: float = 5.0
     believed: int = 3
     hold: int = 16
-    natural: float = 0.1
     rare: float = 3.0
     away: float = 2.0
     trust: int = 6
     frozen: float = 0.001
-    coarse: float = 0.1
     first: int = 16
 
     def __post_init__(self) -> None:
         for name in ("believed", "hold", "trust", "first"):
             self._set(name, whole("Gate", name, getattr(self, name), 0))
-        for name in ("far", "sure", "natural", "rare", "away", "frozen", "coarse"):
+        for name in ("far", "sure", "rare", "away", "frozen"):
             if getattr(self, name) != np.inf:
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
@@ -103,18 +96,14 @@ def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
     return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
         "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
-        "gate_other": np.nan, "reason": 0,
-        **no_repeats(), **no_inputs(m), **no_samples(gate.first, n, m),
+        "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0,
+        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m),
     }  # fmt: skip
 
 
 def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, float, int], None]:
     """``learn(s, seen, contradicts, own, v, l)``: mean and variance of the readings, the mean of e^2 / own of the
-    samples used, and the error of a settled tracker, which is compared with v.
-
-    A reading that contradicts its forecast counts as no farther than `CLIPPED` variances: one in ten may be far for
-    ever, more of them are usual in the end.
-    """
+    samples used, and the error of a settled tracker, which is compared with v."""
 
     @kernel
     def learn(s: State, seen: bool, contradicts: bool, own: float, v: float, l: int) -> None:
@@ -122,7 +111,7 @@ def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, 
         s.gate_count[l] += 1.0 if seen else 0.0
         share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
         if seen:
-            off = reading(s, l) - s.gate_mean[l]
+            off = measured(s, l) - s.gate_mean[l]
             if contradicts & known:
                 most = np.sqrt(CLIPPED * spread)
                 off = min(max(off, -most), most)
@@ -141,12 +130,11 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
     sure, believed, hold = float(gate.sure) ** 2, gate.believed, gate.hold
-    natural = repeats_by_nature(gate.natural)
 
     @kernel
     def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
         """Whether a far reading is one of a code, or not yet enough of them are a change."""
-        unmoved, strikes = s.gate_steps[l] == 0.0, s.gate_same[l] == 0
+        unmoved, strikes = s.steps[l] == 0.0, s.gate_same[l] == 0
         apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
         near2 = far * s.gate_variance[l]
         turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
@@ -167,9 +155,9 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     @kernel
     def judge(s: State, v: float, l: int) -> bool:
         """Whether the sample contradicts its forecast."""
-        y, e2 = reading(s, l), s.e[l] * s.e[l]
+        y, e2 = measured(s, l), s.e[l] * s.e[l]
         off = y - s.gate_mean[l]
-        predicted, step = s.valid[l] > 0.0, s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0
+        predicted, step = s.valid[l] > 0.0, s.finest[l] if s.steps[l] > 0.0 else 0.0
         spread, response = max(s.gate_variance[l], step * step), s.y_hat[l] + s.shift[l] - s.gate_mean[l]
         unusual = predicted & (response * response > rare * spread)
         beyond = off * off > far * (response * response if unusual else spread)
@@ -192,25 +180,6 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
 
 
 @lru_cache(maxsize=256)
-def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
-    """`ModelSteps.foreseeing` with the tracker's forecast once more: no time passes, and no reading is taken in."""
-    started, part = tracker.start is not None, whole_record if tracker.reads_model else tracker_part
-    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, tracker.start or tracker))
-
-    @kernel
-    def forecast(s: State, l: int) -> None:
-        ok, observed = s.ok[l], s.observed[l]
-        s.ok[l], s.observed[l] = 0.0, 0.0
-        if started and s.root[l] > 0:
-            first(part(s), l)
-        else:
-            usual(part(s), l)
-        s.ok[l], s.observed[l] = ok, observed
-
-    return model.foreseeing and model.foreseeing(forecast)
-
-
-@lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
     lends: bool = False, foresee: Step | None = None,
@@ -226,7 +195,6 @@ def gate_step(
     notice, blame = input_rules(gate, ages, refuse)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
-    resolve = resolution(gate.coarse)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
     far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
     learn = usual_rule(sure, lends)
@@ -237,7 +205,7 @@ def gate_step(
         seen = s.observed[l] > 0.0
         remember(s, l)
         notice(s, s.gate_count[l] >= FIRST, l)
-        off, y_hat, e, variance = reading(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
+        off, y_hat, e, variance = measured(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
         if curved and off * off > far * s.gate_variance[l]:
             look(s, l)
         own = 1.0 if lends else s.s[l]
@@ -252,7 +220,7 @@ def gate_step(
             else:
                 contradicts = judge(s, v, l)
         resolve(s, l)
-        s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
+        s.reading[l] = measured(s, l) if seen else s.reading[l]
         learn(s, seen, contradicts, own, v, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 

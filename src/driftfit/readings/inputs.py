@@ -35,30 +35,15 @@ def no_inputs(m: int) -> Mapping[str, Any]:
 
 
 @kernel
-def widen(s: State, j: int, low: float, high: float, l: int) -> None:
-    """The range of input j takes in what was believed."""
-    s.gate_low[j, l] = min(s.gate_low[j, l], low)
-    s.gate_high[j, l] = max(s.gate_high[j, l], high)
-
-
-@kernel
 def forget(s: State, j: int, l: int) -> None:
     """Nothing is outside any more."""
-    s.gate_outside[j, l] = 0
-    s.gate_lowest[j, l], s.gate_highest[j, l] = np.inf, -np.inf
+    s.gate_outside[j, l], s.gate_lowest[j, l], s.gate_highest[j, l] = 0, np.inf, -np.inf
 
 
 @kernel
-def notice_one(s: State, j: int, away: float, l: int) -> None:
-    """Set the bit of the present sample if the input is outside its range, which takes it in otherwise."""
-    u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
-    if abs(u) < np.inf:
-        if abs(2.0 * u - (low + high)) > away * (high - low):
-            s.gate_lowest[j, l] = min(s.gate_lowest[j, l], u)
-            s.gate_highest[j, l] = max(s.gate_highest[j, l], u)
-            s.gate_outside[j, l] |= 1
-        else:
-            widen(s, j, u, u, l)
+def widen(s: State, j: int, u: float, l: int) -> None:
+    """The range of input j takes in a value that was believed."""
+    s.gate_low[j, l], s.gate_high[j, l] = min(s.gate_low[j, l], u), max(s.gate_high[j, l], u)
 
 
 def input_rules(
@@ -66,8 +51,7 @@ def input_rules(
 ) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
     """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, the
     number of the first input that is blamed for it, from 1, or 0, of a model that remembers the inputs of ``ages``
-    samples besides the present.
-    """
+    samples besides the present."""
     away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
     all_ages = (1 << (ages + 1)) - 1
 
@@ -75,17 +59,16 @@ def input_rules(
     def notice(s: State, known: bool, l: int) -> None:
         for j in range(s.gate_low.shape[0]):
             if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
-                widen(s, j, s.gate_lowest[j, l], s.gate_highest[j, l], l)
+                widen(s, j, s.gate_lowest[j, l], l)
+                widen(s, j, s.gate_highest[j, l], l)
                 forget(s, j, l)
-            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) & all_ages
-            notice_one(s, j, away if known else np.inf, l)
-
-    @kernel
-    def take_out(s: State, j: int, l: int) -> None:
-        for age in range(ages, -1, -1):
-            if (s.gate_outside[j, l] >> age) & 1 > 0:
-                refuse(s, j, age, l)
-        forget(s, j, l)
+            u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
+            strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
+            s.gate_outside[j, l] = ((s.gate_outside[j, l] << 1) & all_ages) | (1 if strange else 0)
+            if strange:
+                s.gate_lowest[j, l], s.gate_highest[j, l] = min(s.gate_lowest[j, l], u), max(s.gate_highest[j, l], u)
+            elif abs(u) < np.inf:
+                widen(s, j, u, l)
 
     @kernel
     def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
@@ -99,7 +82,10 @@ def input_rules(
             return 0
         s.gate_blamed[l] += 1
         for j in range(s.gate_low.shape[0]):
-            take_out(s, j, l)
+            for age in range(ages, -1, -1):
+                if (s.gate_outside[j, l] >> age) & 1 > 0:
+                    refuse(s, j, age, l)
+            forget(s, j, l)
         return first
 
     return notice, blame

@@ -1,15 +1,16 @@
-"""What a gate left out: in words, as a table, and of a stream as counts and the last of it."""
+"""What a gate left out: in words, and as a table."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED, SIGNAL
+from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED
 
 SAID: Mapping[int, tuple[str, str]] = {
     REFUSED: ("Left out", "far outside the range of the others, which the model did not predict"),
@@ -18,44 +19,8 @@ SAID: Mapping[int, tuple[str, str]] = {
     AT_START: ("Left out at the start", "contradicted by the others among the first"),
 }
 """For each reason its label in a summary, and what is said of the samples."""
-NAMED = 3
-"""Values that a warning names at most."""
 KEPT = 16
 """Decisions that a stream keeps, and rows of a printed table at most."""
-
-
-def counts(reason: Array) -> dict[int, int]:
-    """How many samples (T,) there are for each reason but USED."""
-    return {one: count for one in SAID if (count := int(np.count_nonzero(reason == one)))}
-
-
-def remarks(count: Mapping[int, int]) -> tuple[tuple[str, str], ...]:
-    """The lines of a summary: nothing if nothing was left out."""
-    return tuple(
-        (SAID[one][0], f"{k} sample{'s' if k > 1 else ''} {SAID[one][1]}: not used") for one, k in count.items()
-    )
-
-
-def floor_remark(floor: float) -> tuple[tuple[str, str], ...]:
-    """The line on a coarse meter, given the floor of the noise variance: nothing if there is none."""
-    step = np.sqrt(12.0 * floor)
-    said = f"steps of {step:.4g}: the noise variance is taken to be at least {floor:.3g}"
-    return (("Resolution", said),) if floor > 0.0 else ()
-
-
-def ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
-    """What is warned of after a run without a gate, given the values of each signal that look like codes, and whether
-    the model is linear in theta."""
-    said = "; ".join(_codes(name, values) for name, values in found.items())
-    lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
-    return f"{said}. Such readings enter the estimate; gate=True leaves them out.{lasting}"
-
-
-def _codes(name: str, values: Sequence[float]) -> str:
-    different = list(dict.fromkeys(values))
-    named = ", ".join(f"{value:g}" for value in different[:NAMED]) + (", .." if len(different) > NAMED else "")
-    which = "value looks like a fault code" if len(values) == 1 else "values look like fault codes"
-    return f"{name}: {len(values)} {which} ({named})"
 
 
 class Decision(NamedTuple):
@@ -94,7 +59,7 @@ class LeftOut:
     @property
     def counts(self) -> dict[str, int]:
         """How many samples there are for each reason, by the name that summaries use."""
-        return {SAID[code][0]: count for code, count in counts(self.code).items()}
+        return {label: count for code, (label, _) in SAID.items() if (count := int(np.sum(self.code == code)))}
 
     def applied(self, y: Array, noise: Array) -> tuple[Array, Array]:
         """Readings y (T,) and factors of the noise variance (T,) with these decisions: refused readings are NaN, and
@@ -124,44 +89,9 @@ NONE = np.empty(0, int)
 NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE)
 
 
-def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
-    """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
-    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
-    sample = np.flatnonzero(decided)
-    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
-    refused = sample[signal == 0]
-    after = (sample[:, None] + np.arange(ages + 1)).ravel()
-    after = np.setdiff1d(after[after < len(y)], refused)
-    unused = after[~ok[after] & np.isfinite(y[after])]
-    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
-
-
 def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:
     """The lines on what was left out of a record, or of several together."""
     several = [found] if isinstance(found, LeftOut) else found.values()
-    return remarks(counts(np.concatenate([NONE, *(one.code for one in several)])))
-
-
-class Tally:
-    """What the gate of a stream left out: ``counts`` of samples by reason, as summaries call it, and the ``last`` 16
-    decisions, the newest at the end."""
-
-    def __init__(self, counted: Mapping[str, int] | None = None, last: Iterable[Sequence[Any]] = ()) -> None:
-        """Nothing, or what `plain` wrote."""
-        self.counts: dict[str, int] = dict(counted or {})
-        self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
-
-    def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
-        """Count a sample that was not used, with the names of the output and the inputs."""
-        signal, code = divmod(int(decided), SIGNAL)
-        name, reason = SAID[code]
-        self.counts[name] = self.counts.get(name, 0) + 1
-        self.last = (*self.last, Decision(sample, names[signal], value, reason))[-KEPT:]
-
-    def __repr__(self) -> str:
-        said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
-        return f"{said}\n{table(self.last)}" if said else "nothing left out"
-
-    def plain(self) -> list[Any]:
-        """The state as plain data."""
-        return [self.counts, [list(one) for one in self.last]] if self.counts else []
+    total = sum((Counter(one.counts) for one in several), Counter[str]())
+    rows = [(label, total[label], said) for label, said in SAID.values() if total[label]]
+    return tuple((label, f"{count} sample{'s' if count > 1 else ''} {said}: not used") for label, count, said in rows)

@@ -31,77 +31,80 @@ few comparisons.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import State, Step, exp, kernel
+from driftfit.engine.kernel import State, exp, kernel
 
+SHARE = 0.1
+"""Share of the readings that repeat, and of the steps that are of the size of the quantum, from which on they count."""
+ENOUGH = 3.0
+"""How many of them there are before they count."""
 MOVED = 0.25
 """Share of the variance of the forecast by which the square of its change counts as a movement."""
 STAY = 0.98
 """Probability per reading that a frozen sensor stays frozen."""
 BELIEVED = -1.0
 """In place of the probability that a sensor is frozen, until the reading changes: it is a level that repeats."""
-ENOUGH = 5.0
-"""Number of repeats, and of steps of the size of the quantum, before they count."""
 
 
-def no_repeats() -> Mapping[str, Any]:
-    """Fields before the first reading."""
-    return {
-        "gate_before": np.nan, "gate_finest": np.inf, "gate_smallest": 0.0, "gate_steps": 0.0, "gate_repeats": 0.0,
-        "gate_stuck": 0.0, "gate_forecast": np.nan, "floor": 0.0, "shift": 0.0,
-    }  # fmt: skip
+def unread() -> dict[str, Any]:
+    """Fields of `note_reading`: the last one, how often it has come again, the smallest step, and the shift of y."""
+    return {"reading": np.nan, "alike": 0.0, "finest": np.inf, "shift": 0.0}
+
+
+def unresolved() -> dict[str, Any]:
+    """Fields of `resolve`: how many steps have the size of the smallest, how many steps and repeats there were."""
+    return {**unread(), "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "floor": 0.0}
 
 
 @kernel
-def reading(s: State, l: int) -> float:
+def measured(s: State, l: int) -> float:
     """The output as it was measured."""
     return s.y[l] + s.shift[l]  # type: ignore[no-any-return]
 
 
 @kernel
 def repeats_last(s: State, l: int) -> bool:
-    """Whether the reading repeats the one before in all digits, but for the rounding of a shift."""
-    y = reading(s, l)
-    return abs(y - s.gate_before[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
+    """Whether the reading repeats the last one in all digits, but for the rounding of a shift."""
+    y = measured(s, l)
+    return abs(y - s.reading[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
 
 
-def repeats_by_nature(share: float) -> Callable[[State, int], bool]:
-    """``natural(s, l)``: whether so large a share of the readings repeat that a repeat is no sign of a code."""
-    share = float(share)
-
-    @kernel
-    def natural(s: State, l: int) -> bool:
-        repeats = s.gate_repeats[l]
-        return (repeats >= ENOUGH) & (repeats >= share * (repeats + s.gate_steps[l]))  # type: ignore[no-any-return]
-
-    return natural  # type: ignore[no-any-return]
+@kernel
+def natural(s: State, l: int) -> bool:
+    """Whether so large a share of the readings repeat that a repeat is no sign of a code."""
+    repeats = s.repeats[l]
+    return (repeats >= ENOUGH) & (repeats >= SHARE * (repeats + s.steps[l]))  # type: ignore[no-any-return]
 
 
-def resolution(share: float) -> Step:
+@kernel
+def note_reading(s: State, l: int) -> None:
+    """Whether a reading repeats the last one, and the smallest step."""
+    if s.observed[l] > 0.0:
+        step, repeated = abs(measured(s, l) - s.reading[l]), repeats_last(s, l)
+        s.alike[l] = s.alike[l] + 1.0 if repeated else 0.0
+        s.finest[l] = step if (not repeated) & (step < s.finest[l]) else s.finest[l]  # NaN at the first reading
+        s.reading[l] = measured(s, l)
+
+
+@kernel
+def resolve(s: State, l: int) -> None:
     """Learn from a reading that was accepted, and set the floor."""
-    share = float(share)
-    natural = repeats_by_nature(share)
-
-    @kernel
-    def resolve(s: State, l: int) -> None:
-        if s.observed[l] > 0.0:
-            step, finest = abs(reading(s, l) - s.gate_before[l]), s.gate_finest[l]
-            if repeats_last(s, l):
-                s.gate_repeats[l] += 1.0
-            elif step > 0.0:  # NaN at the first reading
-                s.gate_steps[l] += 1.0
-                kept = s.gate_smallest[l] if step >= 0.75 * finest else 0.0
-                s.gate_smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
-                s.gate_finest[l] = min(step, finest)
-            coarse = natural(s, l) & (s.gate_smallest[l] >= max(ENOUGH, share * s.gate_steps[l]))
-            s.floor[l] = s.gate_finest[l] * s.gate_finest[l] / 12.0 if coarse else 0.0
-
-    return resolve  # type: ignore[no-any-return]
+    step, finest = abs(measured(s, l) - s.reading[l]), s.finest[l]
+    note_reading(s, l)
+    if s.observed[l] > 0.0:
+        if s.alike[l] > 0.0:
+            s.repeats[l] += 1.0
+        elif step > 0.0:
+            s.steps[l] += 1.0
+            kept = s.smallest[l] if step >= 0.75 * finest else 0.0
+            s.smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
+        coarse = natural(s, l) & (s.smallest[l] >= max(ENOUGH, SHARE * s.steps[l]))
+        s.floor[l] = s.finest[l] * s.finest[l] / 12.0 if coarse else 0.0
 
 
 def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
@@ -111,19 +114,19 @@ def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
     @kernel
     def chance_of_repeat(s: State, v: float, l: int) -> float:
         """The probability at most that a sensor that works repeats its reading."""
-        quantum, repeats = s.gate_finest[l], s.gate_repeats[l]
+        quantum, repeats = s.finest[l], s.repeats[l]
         off = max(abs(s.e[l]) - 0.5 * quantum, 0.0)
         density = exp(-0.5 * off * off / v) / np.sqrt(2.0 * np.pi * v)
-        return min(max(repeats / (repeats + s.gate_steps[l]), quantum * density), 1.0)  # type: ignore[no-any-return]
+        return min(max(repeats / (repeats + s.steps[l]), quantum * density), 1.0)  # type: ignore[no-any-return]
 
     @kernel
     def frozen(s: State, v: float, l: int) -> bool:
         found, repeats = 0.0, repeats_last(s, l)
         if repeats & (s.gate_stuck[l] < 0.0):
             found = BELIEVED
-        elif repeats & (s.gate_steps[l] >= 2.0 * ENOUGH):
+        elif repeats & (s.steps[l] >= 2.0 * ENOUGH):
             prior = enter * (1.0 - s.gate_stuck[l]) + STAY * s.gate_stuck[l]
-            quantum, tells = s.gate_finest[l], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
+            quantum, tells = s.finest[l], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
             moved = s.y_hat[l] + s.shift[l] - s.gate_forecast[l]
             tells &= moved * moved > max(MOVED * v, quantum * quantum)
             chance = chance_of_repeat(s, v, l) if tells else 1.0

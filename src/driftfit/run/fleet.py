@@ -28,8 +28,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, warn
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, left_out_of
+from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.columns import COLLECTED, OfRecord, attribute, collect
+from driftfit.run.gating import left_out_of
 from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import PROGRESS_SAMPLES, Program, State, kept, lanes_of, shown, state_of, tile_of

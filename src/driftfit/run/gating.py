@@ -1,12 +1,22 @@
-"""Which gate stands before a tracker, and what it found among the first samples."""
+"""Which gate stands before a tracker, and what it left out of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
 
 from driftfit.data.record import Record
-from driftfit.readings.first_samples import First
-from driftfit.readings.gate import Gate
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
+from driftfit.engine.kernel import Array, State, Step, kernel, nothing
+from driftfit.engine.phases import forecasting
+from driftfit.engine.tracker_part import tracker_part, whole_record
+from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES, U
+from driftfit.readings.gate import SIGNAL, Gate
+from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
 
 
@@ -19,9 +29,69 @@ def gate_of(tracker: Tracker, gate: Gate | bool | None) -> Gate | None:
     return Gate() if (tracker.gated if gate is None else gate) else None
 
 
+@lru_cache(maxsize=256)
+def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
+    """`ModelSteps.foreseeing` with the tracker's forecast once more: no time passes, and no reading is taken in."""
+    started, part = tracker.start is not None, whole_record if tracker.reads_model else tracker_part
+    usual, first = (forecasting(one._replace(predict=nothing)) for one in (tracker, tracker.start or tracker))
+
+    @kernel
+    def forecast(s: State, l: int) -> None:
+        ok, observed = s.ok[l], s.observed[l]
+        s.ok[l], s.observed[l] = 0.0, 0.0
+        if started and s.root[l] > 0:
+            first(part(s), l)
+        else:
+            usual(part(s), l)
+        s.ok[l], s.observed[l] = ok, observed
+
+    return model.foreseeing and model.foreseeing(forecast)
+
+
+def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[str]) -> LeftOut:
+    """The decisions in a run, from what its gate stored for every sample (T,), its readings, which samples were used
+    once all was decided, how many samples its model remembers inputs, and the names of the output and the inputs."""
+    sample = np.flatnonzero(decided)
+    signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
+    refused = sample[signal == 0]
+    after = (sample[:, None] + np.arange(ages + 1)).ravel()
+    after = np.setdiff1d(after[after < len(y)], refused)
+    unused = after[~ok[after] & np.isfinite(y[after])]
+    return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
+
+
 def without_start(gate: Gate | None) -> Gate | None:
     """A gate that does not judge first samples together: those of several outputs cannot be run again alone."""
     return None if gate is None else replace(gate, first=0)
+
+
+class First(NamedTuple):
+    """The first samples, each as often as it came, up to the present one."""
+
+    y: Array
+    """Readings (k,)."""
+    u: Array
+    """Inputs (k, m); of samples that made room for others NaN."""
+    known: Array
+    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
+    codes: Array
+    """Which signals (k, 1 + m), the output first, are codes."""
+    reason: Array
+    """What was decided (k,), as a gate stores it."""
+
+    def without_codes(self) -> tuple[Array, Array]:
+        """(readings (k,), inputs (k, m)), NaN where they are codes."""
+        return np.where(self.codes[:, 0], np.nan, self.y), np.where(self.codes[:, 1:], np.nan, self.u)
+
+
+def replayed(lane: Mapping[str, Array], m: int) -> First:
+    """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
+    rows, dropped = np.array(lane["gate_first"][: int(lane["gate_kept"])]), int(lane["gate_replay"]) - 1
+    rows[0, TIMES] += dropped
+    rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
+    rows[:dropped, U : U + m] = np.nan
+    codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
+    return First(rows[:, READING], rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros(len(rows)))
 
 
 def without_codes(record: Record, last: int, first: First) -> Record:

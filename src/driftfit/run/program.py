@@ -25,11 +25,10 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.first_samples import First, replayed
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, foreseeing, gate_step
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import gate_of, without_start
+from driftfit.run.gating import First, foreseeing, gate_of, replayed, without_start
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -152,7 +151,7 @@ class Program:
     @property
     def scratch(self) -> tuple[str, ...]:
         """Fields that carry nothing from one sample to the next."""
-        return self.tracker.scratch if self.gate is None else (*self.tracker.scratch, "gate_fit")
+        return self.tracker.scratch if self.gate is None else (*self.tracker.scratch, "gate_fit", "gate_doubt", "raw_y")
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -14,11 +14,10 @@ from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, left_out_of
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.run.columns import OfRecord, attribute
-from driftfit.run.gating import without_codes
+from driftfit.run.gating import First, left_out_of, without_codes
 from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of

@@ -22,7 +22,7 @@ from driftfit.data.record import Reading, Record, Records
 from driftfit.engine.settings import near, one_of, warn
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut, ungated
+from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.screen import apart, screen
 from driftfit.run.fleet import Fleet, KeyedResults, Outputs, run_fleet
 from driftfit.run.gating import gate_of
@@ -34,6 +34,8 @@ from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
 KEPT = ("std", "cov", "theta")
+NAMED = 3
+"""Values that a warning names at most."""
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
@@ -273,7 +275,22 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
             found[name] += values
             linear &= run.model.hidden is None and not (run.model.implicit or run.program.settling)
     if found:
-        warn(f"{verb}: {ungated(found, linear)}")
+        warn(f"{verb}: {_ungated(found, linear)}")
+
+
+def _ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
+    """What is warned of after a run without a gate, given the values of each signal that look like codes, and whether
+    the model is linear in theta."""
+    said = "; ".join(_named(name, values) for name, values in found.items())
+    lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
+    return f"{said}. Such readings enter the estimate; gate=True leaves them out.{lasting}"
+
+
+def _named(name: str, values: Sequence[float]) -> str:
+    different = list(dict.fromkeys(values))
+    named = ", ".join(f"{value:g}" for value in different[:NAMED]) + (", .." if len(different) > NAMED else "")
+    which = "value looks like a fault code" if len(values) == 1 else "values look like fault codes"
+    return f"{name}: {len(values)} {which} ({named})"
 
 
 def _codes(run: Track) -> dict[str, list[float]]:

@@ -28,7 +28,7 @@ from driftfit.judge.compare import Comparison, compare, left_at_start, persisten
 from driftfit.models.base import GAP
 from driftfit.models.equation import Equation
 from driftfit.models.state_space import StateSpace
-from driftfit.readings.left_out import floor_remark, remarks_of
+from driftfit.readings.left_out import remarks_of
 from driftfit.run.fleet import KeyedResults, Outputs
 from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track, burn_in, root_mean_square
@@ -177,12 +177,17 @@ def _signals(labels: Labels) -> str:
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
 
 
+def _resolution(run: Track) -> tuple[tuple[str, str], ...]:
+    """The step of a coarse meter, where a gate or the tracker looked for it."""
+    floor = float(run.state["floor"])
+    said = f"steps of {np.sqrt(12.0 * floor):.4g}, whose rounding has a variance of {floor:.3g}"
+    return (("Resolution", said),) if floor > 0.0 else ()
+
+
 def _gate(run: Track) -> tuple[tuple[str, str], ...]:
-    """What the gate left out, a line for each reason; nothing without a gate."""
-    left = remarks_of(run.left_out)
-    if run.program.gate is None:
-        return left
-    return (*left, *floor_remark(float(run.state["floor"]))) or (("Gate", "nothing left out"),)
+    """What the gate left out, a line for each reason, and the step of a coarse meter."""
+    left = (*remarks_of(run.left_out), *_resolution(run))
+    return left or (() if run.program.gate is None else (("Gate", "nothing left out"),))
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:

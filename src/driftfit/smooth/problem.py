@@ -21,18 +21,18 @@ from driftfit.smooth.unknown_drift import average_drift
 from driftfit.trackers.base import RandomWalk
 
 
-@kernel
-def note_noise(s: State, l: int) -> None:
-    s.used_noise[l] = s.noise[l]
-
-
 @lru_cache
 def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
     """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """
-    store = steps.store_for_smoother
+    store, note = steps.store_for_smoother, steps.note
+
+    @kernel
+    def note_all(s: State, l: int) -> None:
+        note(s, l)
+        s.used_noise[l] = s.noise[l]
 
     @kernel
     def collect_all(o: State, s: State, l: int) -> None:
@@ -42,7 +42,7 @@ def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
         o.ok[l] = s.ok[l]
         o.e[l] = s.e[l]
 
-    return steps._replace(store=collect_all, note=note_noise)
+    return steps._replace(store=collect_all, note=note_all)
 
 
 ROWS = 1024

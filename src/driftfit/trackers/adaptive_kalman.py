@@ -48,6 +48,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import whole
+from driftfit.readings.repeats import note_reading
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
     FRAME,
@@ -101,7 +102,6 @@ from driftfit.trackers.mixture.states import (
     learn_noise,
     least_noise,
     noise_prior,
-    note_reading,
     repeated_rounding,
     store_for_smoother,
 )
@@ -139,7 +139,6 @@ def look_ahead(s: State, l: int) -> None:
 def follow(s: State, l: int) -> None:
     """One sample of the running filters."""
     s.nu[OUTLYING, l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
-    note_reading(s, l)
     column = int(s.at_start[ENTERING, l])
     if s.ok[l] > 0.0 and column >= 0:
         enter_filters(s, column, l)
@@ -256,7 +255,6 @@ class AdaptiveKalman(Tracker):
             "scale": np.nan,
             "count": 0.0,
             "settled": 0,
-            "shift": 0.0,
             "vague": 0.0,
             **knowing_nothing(n),
             **no_excitation(n),
@@ -281,6 +279,7 @@ class AdaptiveKalman(Tracker):
             machines=(*FRAME, machine_drift),
             doubts=True,
             outlined=True,
+            note=note_reading,
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:

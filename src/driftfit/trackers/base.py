@@ -56,7 +56,7 @@ class Tracker(Settings, ABC):
     replaces: ClassVar[tuple[str, ...]] = ("shift",)
     """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's.
     ``shift`` is common to all: what the model subtracted from y, for trackers that judge readings
-    (`driftfit.trackers.forms.resolution`).
+    (`driftfit.readings.repeats`).
     """
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""

@@ -32,6 +32,7 @@ from driftfit.bank.machine.advance import bank
 from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, read_framed, spans_lags
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
+from driftfit.readings.repeats import resolve
 from driftfit.trackers.forms.coordinates import FRAME, new_row, whiten_within
 from driftfit.trackers.forms.covariance import prediction
 from driftfit.trackers.forms.diffuse import (
@@ -48,12 +49,13 @@ from driftfit.trackers.forms.diffuse import (
 )
 from driftfit.trackers.forms.diffuse import hand_over as choose_form
 from driftfit.trackers.forms.excitation import learn_scales
-from driftfit.trackers.forms.resolution import lasting, learn_resolved_scale, least_noise, resolve
 from driftfit.trackers.mixture.states import LEAST_SHARE
 from driftfit.trackers.student import RESIDUALS, wider
 
 BASES = len(BASE_NAMES)
 GIVEN, GIVEN_CHAIN, DRIFT, LAG_ROWS = (ROW[name] for name in ("given", "given_chain", "drift", "lag_rows"))
+LONGEST = 4.0
+"""At most so many repeated readings in a row count."""
 
 
 @kernel
@@ -132,9 +134,25 @@ def run(s: State, l: int) -> None:
 
 @kernel
 def repeated(s: State, l: int) -> float:
-    """The factor of the noise variance for a repeated reading of a coarse meter, in units of the last innovation's."""
-    known = s.coarse[l] > 0.0 and s.s[l] < np.inf
-    return 1.0 + lasting(s, l) / max(s.coarse[l], s.s[l]) if known else 1.0
+    """The factor of the noise variance for a repeated reading of a coarse meter, which shares its error of rounding."""
+    return 1.0 + min(s.alike[l], LONGEST) if s.floor[l] > 0.0 else 1.0
+
+
+@kernel
+def least_noise(s: State, l: int) -> float:
+    """The least r."""
+    return max(LEAST_SHARE * s.power[l] + 1e-300, s.floor[l] / s.noise[l])  # type: ignore[no-any-return]
+
+
+@kernel
+def learn_scale(s: State, l: int) -> None:
+    """Count the innovation; s.s becomes a variance with the scale known before this sample, and s.scale is updated."""
+    counted = s.ok[l] if (s.alike[l] < 1.0) | (s.floor[l] > 0.0) else 0.0
+    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
+    s.count[l] += counted
+    s.s[l] *= s.scale[l]
+    scale, least = s.squares[l] / s.count[l], s.floor[l] / s.noise[l]
+    s.scale[l] = least if least > scale else scale  # NaN is kept
 
 
 @kernel
@@ -143,14 +161,10 @@ def hand_over(s: State, l: int) -> None:
     n, memory = s.theta.shape[0], floats(memory_at(s), s.table[MEMORY_AT, 2, l], s.theta.shape[1])
     for k in range(s.table[OUTPUT_LAGS, 0, l]):
         memory[s.table[LAG_ROWS, 0, l] // 8 + k * (n + 1) + n, l] = s.phi[k, l]
-    s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = (
-        s.y[l],
-        s.noise[l] * repeated(s, l),
-        s.dt[l],
-    )
+    s.sample[SAMPLE.y, l], s.sample[SAMPLE.noise, l], s.sample[SAMPLE.dt, l] = s.y[l], s.noise[l], s.dt[l]
     s.sample[SAMPLE.time, l], s.sample[SAMPLE.shift, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l], s.observed[l]
-    s.sample[SAMPLE.r, l], s.sample[SAMPLE.least, l] = s.r[l], max(LEAST_SHARE * s.power[l] + 1e-300, least_noise(s, l))
+    s.sample[SAMPLE.r, l], s.sample[SAMPLE.least, l] = s.r[l], least_noise(s, l)
     s.sample[SAMPLE.most, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
@@ -161,10 +175,11 @@ def alone(s: State, l: int) -> None:
     residuals = s.count[l]
     s.sample[SAMPLE.freedom, l] = residuals if s.unknown[l] > 0 else np.inf
     if s.unknown[l] > 0 and s.s[l] < np.inf:
-        learn_resolved_scale(s, l)
+        learn_scale(s, l)
         s.scale[l] *= wider(s.count[l])
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
+    s.sample[SAMPLE.noise, l] *= repeated(s, l)
     s.sample[SAMPLE.y_hat, l], s.sample[SAMPLE.s, l] = s.y_hat[l], s.s[l] / wider(residuals)
     s.sample[SAMPLE.squares, l], s.sample[SAMPLE.times, l] = s.squares[l], s.count[l]
     ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
@@ -220,17 +235,21 @@ def enter(s: State, column: int, l: int) -> None:
 
 @kernel
 def correct_tree(s: State, l: int) -> None:
-    """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight."""
-    column, outside = s.column[l], s.s[l] == np.inf
+    """The tree takes the sample, unless a gate refused it; one that enters a coordinate changes no weight.
+
+    A reading that repeats is known less surely to the tree, but was predicted as any other.
+    """
+    column, outside, more = s.column[l], s.s[l] == np.inf, repeated(s, l)
+    s.sample[SAMPLE.noise, l], s.sample[SAMPLE.least, l] = s.noise[l] * more, least_noise(s, l)
     s.sample[SAMPLE.ok, l], s.sample[SAMPLE.observed, l] = s.ok[l] if column < 0 else 0.0, s.observed[l]
     run(s, l)
     if column >= 0 and s.ok[l] > 0.0:
         enter(s, column, l)
-        if not outside:
-            e, v = s.y[l] - s.y_hat[l], s.s[l]
-            floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
-                log(2.0 * np.pi * v) + e * e / v
-            )
+    if (column >= 0 or more > 1.0) and s.ok[l] > 0.0 and not outside:
+        e, v = s.y[l] - s.y_hat[l], s.s[l]
+        floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
+            log(2.0 * np.pi * v) + e * e / v
+        )
     learn_scales(s, l)
 
 
@@ -248,7 +267,6 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
 
 @kernel
 def forecast(s: State, l: int) -> None:
-    resolve(s, l)
     if s.counters[COUNTER.settled, l] > 0:
         forecast_tree(s, l)
     else:
@@ -280,7 +298,7 @@ def read(s: State, l: int) -> None:
 
 STEPS = TrackerSteps(
     nothing, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
-    outlined=True,
+    outlined=True, note=resolve,
 )  # fmt: skip
 
 

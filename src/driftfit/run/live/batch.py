@@ -16,11 +16,10 @@ from driftfit.data.instants import instant
 from driftfit.data.record import Known, Reading, Records
 from driftfit.engine.drivers import DRIFT, INTERVAL, NOISE
 from driftfit.engine.kernel import Array
-from driftfit.readings.first_samples import First
 from driftfit.readings.gate import AT_START, SIGNAL
-from driftfit.readings.left_out import Tally
 from driftfit.run.columns import SCALARS, Columns, attribute
-from driftfit.run.live.stream import HELD, Stream, check_applied
+from driftfit.run.gating import First
+from driftfit.run.live.stream import HELD, Stream, Tally, check_applied
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
 

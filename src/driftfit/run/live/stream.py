@@ -23,7 +23,8 @@ from driftfit.engine.kernel import Array, Driver, Step
 from driftfit.engine.settings import as_numbers, factor, near, numbers, vector, whole
 from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.models.base import Model
-from driftfit.readings.left_out import Tally
+from driftfit.readings.gate import SIGNAL
+from driftfit.readings.left_out import KEPT, SAID, Decision, table
 from driftfit.run.columns import attribute
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import Window
@@ -80,6 +81,31 @@ def _compiled(step: Step) -> Driver:
             step(s, l)
 
     return apply
+
+
+class Tally:
+    """What the gate of a stream left out: ``counts`` of samples by reason, as summaries call it, and the ``last`` 16
+    decisions, the newest at the end."""
+
+    def __init__(self, counted: Mapping[str, int] | None = None, last: Iterable[Sequence[Any]] = ()) -> None:
+        """Nothing, or what `plain` wrote."""
+        self.counts: dict[str, int] = dict(counted or {})
+        self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
+
+    def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
+        """Count a sample that was not used, with the names of the output and the inputs."""
+        signal, code = divmod(int(decided), SIGNAL)
+        name, reason = SAID[code]
+        self.counts[name] = self.counts.get(name, 0) + 1
+        self.last = (*self.last, Decision(sample, names[signal], value, reason))[-KEPT:]
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
+        return f"{said}\n{table(self.last)}" if said else "nothing left out"
+
+    def plain(self) -> list[Any]:
+        """The state as plain data."""
+        return [self.counts, [list(one) for one in self.last]] if self.counts else []
 
 
 def check_applied(expected: int) -> None:

@@ -64,7 +64,6 @@ from driftfit.trackers.mixture.states import (
     N,
     T,
     V,
-    note_reading,
     sum_of_row,
 )
 
@@ -392,12 +391,11 @@ def take_start(s: State, l: int) -> None:
     """A sample of least squares, and its residual if the reading did not repeat the one before."""
     if s.remembered[l] < WINDOW:
         s.samples[s.remembered[l], SINCE, l] += s.dt[l] * s.drift[l]
-    note_reading(s, l)
     learn_scales(s, l)
     learn_means(s, l)
     learn_information(s, s.noise[l], l)
     absorb_on_roots(s, l)
-    if (s.h[l] < math.inf) & (s.repeats[l] < 1.0):
+    if (s.h[l] < math.inf) & (s.alike[l] < 1.0):
         sum_before = s.scale[l] * s.count[l] if s.count[l] > 0.0 else 0.0
         s.count[l] += s.ok[l]  # the scale is NaN until there is a residual
         s.scale[l] = (sum_before + s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])) / s.count[l]

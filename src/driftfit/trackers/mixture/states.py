@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.readings.repeats import unread
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
 JUMPS = max(COMMON)
@@ -126,7 +126,8 @@ def any_noise() -> dict[str, Any]:
     """Fields before the first sample."""
     return {
         "nu": np.array([QUIET, 1.0 - QUIET, 0.0]), "nu_prior": np.array([0.0, 0.0, OUTLIER]), "restless": 1.0,
-        "drift_rate": 0.0, "usual_noise": 1.0, "astray": 0.0, "finest": np.inf, "reading": np.nan, "repeats": 0.0,
+        "drift_rate": 0.0, "usual_noise": 1.0, "astray": 0.0,
+        **unread(),
     }  # fmt: skip
 
 
@@ -171,24 +172,9 @@ def noise_prior(s: State, l: int) -> None:
 
 
 @kernel
-def note_reading(s: State, l: int) -> None:
-    """Count readings that repeat, and find the smallest step between two."""
-    if s.observed[l] > 0.0:
-        y = s.y[l] + s.shift[l]
-        step = abs(y - s.reading[l])  # NaN at the first reading
-        if step <= ROUNDING * (abs(y) + abs(s.shift[l])):
-            s.repeats[l] += 1.0
-        else:
-            s.finest[l] = step if step < s.finest[l] else s.finest[l]
-            s.repeats[l] = 0.0
-        s.reading[l] = y
-
-
-@kernel
 def repeated_rounding(s: State, l: int) -> float:
     """Variance that a repeated reading adds to its noise."""
-    share = s.finest[l] * s.finest[l] / 12.0
-    return s.repeats[l] * min(share, s.noise[l] * s.r[l]) if s.repeats[l] > 0.0 else 0.0
+    return s.alike[l] * min(s.finest[l] * s.finest[l] / 12.0, s.noise[l] * s.r[l])  # type: ignore[no-any-return]
 
 
 @partial(kernel, inline=False)
@@ -198,7 +184,7 @@ def learn_noise(s: State, l: int) -> None:
     usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
     far = max(variance_in(s, OUTLYING, l), s.e[l] * s.e[l]) + more
     s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.nu[OUTLYING, l]) * usual + s.nu[OUTLYING, l] / far))
-    if s.repeats[l] > 0.0:
+    if s.alike[l] > 0.0:
         return
     ordinary, wild = 0.0, 0.0
     for j in range(STATES):
