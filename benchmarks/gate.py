@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import Driver, kernel
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
+from driftfit.readings.gate import AT_START, USED, Gate, gate_steps, start
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")
@@ -177,7 +177,7 @@ def nothing(s, l):
     s.reason[l] = 0
 
 
-def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
+def loop_of(regress: Callable, push: Callable, ages: int, judge: Callable, take_out: Callable) -> Callable:
     def loop(tile, Y, U, first, theta, reason, errors):
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0
@@ -190,7 +190,9 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
             forecast(s, l)
             variance(s, l)
             errors[t, 0], errors[t, 1] = s.e[l], s.s[l]
-            gate(s, l)
+            s.reason[l] = ages
+            judge(s, l)
+            take_out(s, l)
             variance(s, l)
             correct(s, l)
             push(s, l)
@@ -228,8 +230,8 @@ class Bench:
 
     def __post_init__(self) -> None:
         regress, push, refuse, self.n, ages = model_of(self.na, self.nb, self.m, self.intercept)
-        self.gated = loop_of(regress, push, gate_step(self.gate, self.n, self.m, ages, refuse))
-        self.plain = loop_of(regress, push, nothing)
+        self.gated = loop_of(regress, push, ages, *gate_steps(self.gate, refuse))
+        self.plain = loop_of(regress, push, ages, nothing, nothing)
 
     def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> Result:
         """The whole record, and first samples once more if they had codes."""

@@ -209,6 +209,16 @@ def covariance(o: State, s: State, l: int) -> None:
             o.P[j, i, l] = s.P[i, j, l] * s.scale[l]
 
 
+class GateSteps(NamedTuple):
+    """The steps of a gate. ``judge`` finds in s.reason for how many samples the model remembers an input, and writes
+    there 0 or why the sample is not used; then ``take_out`` makes inputs missing in the model's memory. The former is
+    compiled once for all models, the latter for each kind of memory.
+    """
+
+    judge: Step
+    take_out: Step
+
+
 class Drivers(NamedTuple):
     """The compiled ways to drive one (model, tracker) pair; see `drivers`."""
 
@@ -231,7 +241,7 @@ def one_or_all(u: Array) -> Any:
 
 
 @lru_cache(maxsize=256)
-def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Step | None = None) -> Drivers:
+def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: GateSteps | None = None) -> Drivers:
     """Build the drivers of a (model, tracker) pair, with a ``gate`` between forecast and correction or without.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for

@@ -202,13 +202,32 @@ def learning(tracker: Any) -> Any:
     return _with_start(learn, tracker, first, usual, late if both else None)
 
 
-def judging(gate: Step, model: Any) -> Any:
-    """The gate between ``looking`` and ``learning``, which sees the inputs and the memory of the model too."""
+def judging(gate: Any, model: Any) -> Any:
+    """The gate between ``looking`` and ``learning``, and what the model forgets of inputs that it blames."""
+    judge, take_out, ages = gate.judge, gate.take_out, model.ages
 
     @partial(kernel, inline=False)
-    def judge(s: State) -> None:
+    def judges(s: State) -> None:
         for l in range(s.theta.shape[1]):
             s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
-            gate(s, l)
+            judge(s, l)
 
-    return judge if model.foreseeing else outlined(judge)
+    @partial(kernel, inline=False)
+    def takes_out(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            take_out(s, l)
+
+    judged, taken_out = judges if model.foreseeing else outlined(judges), outlined(takes_out, short=True)
+
+    @kernel
+    def decide(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            s.reason[l] = ages
+        judged(s)
+        refused = 0
+        for l in range(s.theta.shape[1]):
+            refused = max(refused, s.reason[l])
+        if refused > 0:
+            taken_out(s)
+
+    return decide

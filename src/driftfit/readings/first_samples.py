@@ -26,13 +26,13 @@ Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.kernel import Array, State, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
@@ -99,7 +99,7 @@ def reach(s: State, column: int, center: float, l: int) -> float:
 
 
 @kernel
-def doubt(s: State, implicit: bool, l: int) -> bool:
+def judge_each(s: State, implicit: bool, l: int) -> bool:
     """Write into each sample 1 if its reading is outlying, 2 if a regressor is; whether one has one of the two."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
@@ -210,7 +210,7 @@ def comes_again(s: State, l: int) -> bool:
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     dropped, s.gate_decided[l] = -s.gate_decided[l], 1
-    some = doubt(s, implicit, l)
+    some = judge_each(s, implicit, l)
     whole = (dropped == 0) | (s.gate_first[0, DOUBT, l] == 1.0) & (not comes_again(s, l))
     if some & whole and contradicted(s, l):
         mark(s, ages, l)
@@ -271,11 +271,11 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
         decide(s, ages, implicit, l)
 
 
-def first_samples(ages: int, implicit: bool = False) -> Step:
-    """``remember(s, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
+def first_samples(implicit: bool) -> Callable[[State, int, int], None]:
+    """``remember(s, ages, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
 
     @kernel
-    def remember(s: State, l: int) -> None:
+    def remember(s: State, ages: int, l: int) -> None:
         if s.gate_decided[l] < 1:
             remember_one(s, ages, implicit, l)
 

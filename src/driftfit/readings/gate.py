@@ -38,13 +38,13 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ModelSteps, TrackerSteps
+from driftfit.engine.drivers import GateSteps, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, Step, kernel, nothing
 from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
-from driftfit.readings.inputs import input_rules, no_inputs
+from driftfit.readings.inputs import input_rules, no_inputs, taking_out
 from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
 
 FIRST = 10.0
@@ -211,19 +211,19 @@ def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
 
 
 @lru_cache(maxsize=256)
-def gate_step(
-    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
-    lends: bool = False, foresee: Step | None = None,
-) -> Step:  # fmt: skip
-    """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
+def gate_steps(
+    gate: Gate, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
+    foresee: Step | None = None,
+) -> GateSteps:  # fmt: skip
+    """The gate of a model whose inputs ``refuse(s, signal, age, l)`` makes missing in its memory: input ``signal``,
+    read ``age`` samples ago.
 
-    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
+    The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
     as large as predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends``
     the mean of e^2 takes the place of s, which the tracker does not have.
     """
-    remember = first_samples(ages, implicit)
-    notice, blame = input_rules(gate, ages, refuse)
+    remember = first_samples(implicit)
+    notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     resolve = resolution(gate.coarse)
@@ -233,10 +233,10 @@ def gate_step(
 
     @kernel
     def step(s: State, l: int) -> None:
-        s.reason[l] = USED
+        ages, s.reason[l] = s.reason[l], USED
         seen = s.observed[l] > 0.0
-        remember(s, l)
-        notice(s, s.gate_count[l] >= FIRST, l)
+        remember(s, ages, l)
+        notice(s, ages, s.gate_count[l] >= FIRST, l)
         off, y_hat, e, variance = reading(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
         if curved and off * off > far * s.gate_variance[l]:
             look(s, l)
@@ -256,4 +256,4 @@ def gate_step(
         learn(s, seen, contradicts, own, v, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
-    return step  # type: ignore[no-any-return]
+    return GateSteps(step, taking_out(refuse, SIGNAL))

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import State, Step, kernel
 
 LONGEST = 60
 """Samples that a mask of 64 bits can hold."""
@@ -62,30 +62,22 @@ def notice_one(s: State, j: int, away: float, l: int) -> None:
 
 
 def input_rules(
-    gate: Any, ages: int, refuse: Callable[[State, int, int, int], None]
-) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
-    """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, the
-    number of the first input that is blamed for it, from 1, or 0, of a model that remembers the inputs of ``ages``
-    samples besides the present.
+    gate: Any,
+) -> tuple[Callable[[State, int, bool, int], None], Callable[[State, bool, bool, int], int]]:
+    """``notice(s, ages, known, l)``, which takes in the inputs of a sample of a model that remembers those of ``ages``
+    samples besides it, and ``blame(s, contradicts, usual, l)``: the number, from 1, of the first input that is blamed
+    for the sample, or 0.
     """
-    away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
-    all_ages = (1 << (ages + 1)) - 1
+    away, trust = float(gate.away), gate.trust
 
     @kernel
-    def notice(s: State, known: bool, l: int) -> None:
+    def notice(s: State, ages: int, known: bool, l: int) -> None:
         for j in range(s.gate_low.shape[0]):
-            if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
+            if (s.gate_outside[j, l] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
                 widen(s, j, s.gate_lowest[j, l], s.gate_highest[j, l], l)
                 forget(s, j, l)
-            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) & all_ages
+            s.gate_outside[j, l] = s.gate_outside[j, l] << 1
             notice_one(s, j, away if known else np.inf, l)
-
-    @kernel
-    def take_out(s: State, j: int, l: int) -> None:
-        for age in range(ages, -1, -1):
-            if (s.gate_outside[j, l] >> age) & 1 > 0:
-                refuse(s, j, age, l)
-        forget(s, j, l)
 
     @kernel
     def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
@@ -98,8 +90,23 @@ def input_rules(
         if not (contradicts & usual & (s.gate_blamed[l] < trust)):
             return 0
         s.gate_blamed[l] += 1
-        for j in range(s.gate_low.shape[0]):
-            take_out(s, j, l)
         return first
 
     return notice, blame
+
+
+def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Step:
+    """``take_out(s, l)``: inputs that were outside become missing in the model's memory, by its ``refuse``, if the
+    reason of the sample, from ``blamed`` on, is one of them.
+    """
+
+    @kernel
+    def take_out(s: State, l: int) -> None:
+        if s.reason[l] >= blamed:
+            for j in range(s.gate_low.shape[0]):
+                for age in range(LONGEST, -1, -1):
+                    if (s.gate_outside[j, l] >> age) & 1 > 0:
+                        refuse(s, j, age, l)
+                forget(s, j, l)
+
+    return take_out  # type: ignore[no-any-return]
