@@ -62,11 +62,24 @@ def _late(tracker: Any) -> Any:
     return kernel(late, inline=False)
 
 
-def _wide_samples(tracker: Any) -> tuple[bool, Step, Any]:
-    """Whether the start takes in what a covariance cannot, the step that finds it, and the one that takes it in."""
+def _wide_samples(tracker: Any) -> tuple[bool, Step, Any, Any]:
+    """Whether the start takes in what a covariance cannot, the step that finds it, the one that takes it in, and the
+    latter where a lane has such a sample.
+    """
     if tracker.start is None or tracker.start.take_over is None:
-        return False, nothing, nothing
-    return True, keeps_digits, _late(tracker)
+        return False, nothing, nothing, nothing
+    late = _late(tracker)
+    called = late if tracker.outlined else outlined(late, short=True)
+
+    @kernel
+    def where_late(s: State) -> None:
+        some = 0.0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.late[l])
+        if some > 0.0:
+            called(s)
+
+    return True, keeps_digits, late, where_late
 
 
 @kernel
@@ -142,8 +155,7 @@ def advancing(tracker: Any) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
     predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
     correct, report = tracker.correct, tracker.report
-    both, check, late = _wide_samples(tracker)
-    called = outlined(late, short=True)
+    both, check, late, where_late = _wide_samples(tracker)
 
     @kernel
     def advance(s: State) -> None:
@@ -156,11 +168,7 @@ def advancing(tracker: Any) -> Any:
         for l in range(s.theta.shape[1]):
             report(s, l)
         if both:  # a constant
-            some = 0.0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.late[l])
-            if some > 0.0:
-                called(s)
+            where_late(s)
 
     first = tracker.start and _corrected(forecasting(tracker.start), tracker.start, taken_in)
     other = _corrected(forecasting(tracker), tracker, check)
@@ -183,8 +191,7 @@ def looking(tracker: Any) -> Any:
 
 def learning(tracker: Any) -> Any:
     """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
-    both, check, late = _wide_samples(tracker)
-    called = late if tracker.outlined else outlined(late, short=True)
+    both, check, late, where_late = _wide_samples(tracker)
     usual = _corrected(tracker.variance, tracker, check, tracker.learns_scale)
 
     @kernel
@@ -192,11 +199,7 @@ def learning(tracker: Any) -> Any:
         for l in range(s.theta.shape[1]):
             usual(s, l)
         if both:  # a constant
-            some = 0.0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.late[l])
-            if some > 0.0:
-                called(s)
+            where_late(s)
 
     first = tracker.start and _corrected(tracker.start.variance, tracker.start, taken_in, tracker.learns_scale)
     return _with_start(learn, tracker, first, usual, late if both else None)

@@ -218,7 +218,7 @@ def decide(s: State, ages: int, implicit: bool, l: int) -> None:
 
 
 @kernel
-def repeats(s: State, k: int, l: int) -> bool:
+def comes_once_more(s: State, k: int, l: int) -> bool:
     """Whether the present sample is that kept as number k once more."""
     n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     same = (reading_now(s, l) == s.gate_first[k, READING, l]) & (s.dt[l] == s.gate_first[k, DT, l])
@@ -256,7 +256,7 @@ def keep(s: State, k: int, times: float, l: int) -> None:
 def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     N = s.gate_first.shape[0]
     last = s.gate_kept[l] - 1
-    if last >= 0 and repeats(s, last, l):
+    if last >= 0 and comes_once_more(s, last, l):
         keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
         return
     if s.gate_kept[l] == N:

@@ -45,7 +45,7 @@ from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.engine.tracker_part import tracker_part, whole_record
 from driftfit.readings.first_samples import first_samples, no_samples
 from driftfit.readings.inputs import input_rules, no_inputs, taking_out
-from driftfit.readings.repeats import BELIEVED, frozen_rule, no_repeats, reading, repeats_by_nature, resolution
+from driftfit.readings.repeats import BELIEVED, as_measured, frozen_rule, no_repeats, repeats_by_nature, resolution
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
@@ -122,7 +122,7 @@ def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, 
         s.gate_count[l] += 1.0 if seen else 0.0
         share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
         if seen:
-            off = reading(s, l) - s.gate_mean[l]
+            off = as_measured(s, l) - s.gate_mean[l]
             if contradicts & known:
                 most = np.sqrt(CLIPPED * spread)
                 off = min(max(off, -most), most)
@@ -167,7 +167,7 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     @kernel
     def judge(s: State, v: float, l: int) -> bool:
         """Whether the sample contradicts its forecast."""
-        y, e2 = reading(s, l), s.e[l] * s.e[l]
+        y, e2 = as_measured(s, l), s.e[l] * s.e[l]
         off = y - s.gate_mean[l]
         predicted, step = s.valid[l] > 0.0, s.gate_finest[l] if s.gate_steps[l] > 0.0 else 0.0
         spread, response = max(s.gate_variance[l], step * step), s.y_hat[l] + s.shift[l] - s.gate_mean[l]
@@ -237,7 +237,7 @@ def gate_steps(
         seen = s.observed[l] > 0.0
         remember(s, ages, l)
         notice(s, ages, s.gate_count[l] >= FIRST, l)
-        off, y_hat, e, variance = reading(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
+        off, y_hat, e, variance = as_measured(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
         if curved and off * off > far * s.gate_variance[l]:
             look(s, l)
         own = 1.0 if lends else s.s[l]
@@ -252,7 +252,7 @@ def gate_steps(
             else:
                 contradicts = judge(s, v, l)
         resolve(s, l)
-        s.gate_before[l] = reading(s, l) if seen else s.gate_before[l]
+        s.gate_before[l] = as_measured(s, l) if seen else s.gate_before[l]
         learn(s, seen, contradicts, own, v, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 

@@ -58,7 +58,7 @@ def no_repeats() -> Mapping[str, Any]:
 
 
 @kernel
-def reading(s: State, l: int) -> float:
+def as_measured(s: State, l: int) -> float:
     """The output as it was measured."""
     return s.y[l] + s.shift[l]  # type: ignore[no-any-return]
 
@@ -66,7 +66,7 @@ def reading(s: State, l: int) -> float:
 @kernel
 def repeats_last(s: State, l: int) -> bool:
     """Whether the reading repeats the one before in all digits, but for the rounding of a shift."""
-    y = reading(s, l)
+    y = as_measured(s, l)
     return abs(y - s.gate_before[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
 
 
@@ -90,7 +90,7 @@ def resolution(share: float) -> Step:
     @kernel
     def resolve(s: State, l: int) -> None:
         if s.observed[l] > 0.0:
-            step, finest = abs(reading(s, l) - s.gate_before[l]), s.gate_finest[l]
+            step, finest = abs(as_measured(s, l) - s.gate_before[l]), s.gate_finest[l]
             if repeats_last(s, l):
                 s.gate_repeats[l] += 1.0
             elif step > 0.0:  # NaN at the first reading

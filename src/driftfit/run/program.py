@@ -202,7 +202,7 @@ class Program:
             "gate": None if self.gate is None else self.gate.settings(),
         }
         record = self.tile().dtype
-        return Layout(record, held_in(record, self.tracker_start), self.scratch, owner)
+        return Layout(record, held_in(record, tuple(self.tracker_start)), self.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.layout`)."""
