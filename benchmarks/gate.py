@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.gate_cases import CODES, MODELS, REAL, STARTS, Case
 from driftfit.engine.kernel import Driver, kernel
 from driftfit.readings.first_samples import replayed
-from driftfit.readings.gate import AT_START, USED, Gate, gate_steps, start
+from driftfit.readings.gate import AT_START, USED, Gate, gate_step, start
 
 KALMAN, RLS, MIXTURE = range(3)
 NAMES = ("Kalman", "RLS", "mixture")
@@ -173,11 +173,11 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
 
 
 @kernel
-def nothing(s, l):
-    s.reason[l] = 0
+def nothing(s):
+    s.reason[0] = 0
 
 
-def loop_of(regress: Callable, push: Callable, ages: int, judge: Callable, take_out: Callable) -> Callable:
+def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
     def loop(tile, Y, U, first, theta, reason, errors):
         """Samples from ``first`` on; returns the number of those that are done."""
         s, l = tile[0], 0
@@ -190,9 +190,7 @@ def loop_of(regress: Callable, push: Callable, ages: int, judge: Callable, take_
             forecast(s, l)
             variance(s, l)
             errors[t, 0], errors[t, 1] = s.e[l], s.s[l]
-            s.reason[l] = ages
-            judge(s, l)
-            take_out(s, l)
+            gate(s)
             variance(s, l)
             correct(s, l)
             push(s, l)
@@ -230,13 +228,13 @@ class Bench:
 
     def __post_init__(self) -> None:
         regress, push, refuse, self.n, ages = model_of(self.na, self.nb, self.m, self.intercept)
-        self.gated = loop_of(regress, push, ages, *gate_steps(self.gate, refuse))
-        self.plain = loop_of(regress, push, ages, nothing, nothing)
+        self.gated = loop_of(regress, push, gate_step(self.gate, ages, refuse))
+        self.plain = loop_of(regress, push, nothing)
 
     def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> Result:
         """The whole record, and first samples once more if they had codes."""
         own = fields(self.n, self.m, self.na, self.nb, kind, self.gate, q, r)
-        own["scale"] = r if kind == KALMAN else 1.0
+        own["scale"], own["raw_e"] = r if kind == KALMAN else 1.0, np.nan
         tile, loop = tile_of(own), self.gated if gated else self.plain
         result = Result(np.zeros((len(y), self.n)), np.zeros(len(y), np.int64), np.zeros((len(y), 2)), tile)
         out = result.theta, result.reason, result.errors

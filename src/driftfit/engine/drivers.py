@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import advancing, judging, learning, looking
+from driftfit.engine.phases import advancing, learning, looking
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -209,16 +209,6 @@ def covariance(o: State, s: State, l: int) -> None:
             o.P[j, i, l] = s.P[i, j, l] * s.scale[l]
 
 
-class GateSteps(NamedTuple):
-    """The steps of a gate. ``judge`` finds in s.reason for how many samples the model remembers an input, and writes
-    there 0 or why the sample is not used; then ``take_out`` makes inputs missing in the model's memory. The former is
-    compiled once for all models, the latter for each kind of memory.
-    """
-
-    judge: Step
-    take_out: Step
-
-
 class Drivers(NamedTuple):
     """The compiled ways to drive one (model, tracker) pair; see `drivers`."""
 
@@ -241,7 +231,7 @@ def one_or_all(u: Array) -> Any:
 
 
 @lru_cache(maxsize=256)
-def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: GateSteps | None = None) -> Drivers:
+def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Any = None) -> Drivers:
     """Build the drivers of a (model, tracker) pair, with a ``gate`` between forecast and correction or without.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
@@ -260,7 +250,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: G
     part = whole_record if tracker.reads_model else tracker_part
     phases: tuple[Any, ...] = looking(tracker), learning(tracker)
     phases = tuple(map(outlined, phases)) if tracker.outlined else phases if gate else (advancing(tracker),)
-    sample = _sample(model, tracker.note, phases, gate and judging(gate, model), part)
+    sample = _sample(model, tracker.note, phases, gate, part)
     keep_more = covariance if keep == "cov" else nothing_more
     store = tracker.store if gate is None or keep == "own" else stored_too(tracker.store, store_decision)
     run = _run(sample, tracker.read_extra, _written(keep != "own", store, keep_more, part), part, gate is not None)

@@ -63,9 +63,8 @@ def _late(tracker: Any) -> Any:
 
 
 def _wide_samples(tracker: Any) -> tuple[bool, Step, Any, Any]:
-    """Whether the start takes in what a covariance cannot, the step that finds it, the one that takes it in, and the
-    latter where a lane has such a sample.
-    """
+    """Whether the start takes in what a covariance cannot, the step that finds it, the one that takes it in, and that
+    one if any lane has such a sample."""
     if tracker.start is None or tracker.start.take_over is None:
         return False, nothing, nothing, nothing
     late = _late(tracker)
@@ -153,16 +152,13 @@ def _with_start(usual: Any, tracker: Any, first: Step | None, other: Step, after
 
 def advancing(tracker: Any) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
-    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
-    correct, report = tracker.correct, tracker.report
+    forecasts, correct, report = forecasting(tracker), tracker.correct, tracker.report
     both, check, late, where_late = _wide_samples(tracker)
 
     @kernel
     def advance(s: State) -> None:
         for l in range(s.theta.shape[1]):
-            predict(s, l)
-            forecast(s, l)
-            variance(s, l)
+            forecasts(s, l)
             check(s, l)
             correct(s, l)
         for l in range(s.theta.shape[1]):
@@ -171,22 +167,20 @@ def advancing(tracker: Any) -> Any:
             where_late(s)
 
     first = tracker.start and _corrected(forecasting(tracker.start), tracker.start, taken_in)
-    other = _corrected(forecasting(tracker), tracker, check)
+    other = _corrected(forecasts, tracker, check)
     return _with_start(advance, tracker, first, other, late if both else None)
 
 
 def looking(tracker: Any) -> Any:
     """Time update and forecast of all lanes, before a gate."""
-    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
+    forecasts = forecasting(tracker)
 
     @kernel
     def look(s: State) -> None:
         for l in range(s.theta.shape[1]):
-            predict(s, l)
-            forecast(s, l)
-            variance(s, l)
+            forecasts(s, l)
 
-    return _with_start(look, tracker, tracker.start and forecasting(tracker.start), forecasting(tracker))
+    return _with_start(look, tracker, tracker.start and forecasting(tracker.start), forecasts)
 
 
 def learning(tracker: Any) -> Any:
@@ -203,34 +197,3 @@ def learning(tracker: Any) -> Any:
 
     first = tracker.start and _corrected(tracker.start.variance, tracker.start, taken_in, tracker.learns_scale)
     return _with_start(learn, tracker, first, usual, late if both else None)
-
-
-def judging(gate: Any, model: Any) -> Any:
-    """The gate between ``looking`` and ``learning``, and what the model forgets of inputs that it blames."""
-    judge, take_out, ages = gate.judge, gate.take_out, model.ages
-
-    @partial(kernel, inline=False)
-    def judges(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
-            judge(s, l)
-
-    @partial(kernel, inline=False)
-    def takes_out(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            take_out(s, l)
-
-    judged, taken_out = judges if model.foreseeing else outlined(judges), outlined(takes_out, short=True)
-
-    @kernel
-    def decide(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            s.reason[l] = ages
-        judged(s)
-        refused = 0
-        for l in range(s.theta.shape[1]):
-            refused = max(refused, s.reason[l])
-        if refused > 0:
-            taken_out(s)
-
-    return decide

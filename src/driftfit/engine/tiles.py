@@ -45,7 +45,7 @@ def _common(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@lru_cache(maxsize=256)
+@lru_cache
 def held_in(record: np.dtype[Any], own: tuple[str, ...] = ()) -> tuple[str, ...]:
     """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
     first, second, *rest = _common(0)

@@ -33,13 +33,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import GateSteps, ModelSteps, TrackerSteps
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import State, Step, kernel, nothing
+from driftfit.engine.outlined import outlined
 from driftfit.engine.phases import forecasting
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.engine.tracker_part import tracker_part, whole_record
@@ -210,17 +211,26 @@ def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
     return model.foreseeing and model.foreseeing(forecast)
 
 
-@lru_cache(maxsize=256)
-def gate_steps(
-    gate: Gate, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
-    foresee: Step | None = None,
-) -> GateSteps:  # fmt: skip
-    """The gate of a model whose inputs ``refuse(s, signal, age, l)`` makes missing in its memory: input ``signal``,
-    read ``age`` samples ago.
+def _each_lane(step: Step) -> Any:
+    @partial(kernel, inline=False)
+    def each(s: State) -> None:
+        for l in range(s.reason.shape[0]):
+            step(s, l)
 
-    The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
-    as large as predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends``
-    the mean of e^2 takes the place of s, which the tracker does not have.
+    return each
+
+
+@lru_cache(maxsize=256)
+def gate_step(
+    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
+    foresee: Step | None = None,
+) -> Any:  # fmt: skip
+    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
+
+    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
+    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
+    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
+    e^2 takes the place of s, which the tracker does not have.
     """
     remember = first_samples(implicit)
     notice, blame = input_rules(gate)
@@ -234,6 +244,7 @@ def gate_steps(
     @kernel
     def step(s: State, l: int) -> None:
         ages, s.reason[l] = s.reason[l], USED
+        s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
         seen = s.observed[l] > 0.0
         remember(s, ages, l)
         notice(s, ages, s.gate_count[l] >= FIRST, l)
@@ -256,4 +267,18 @@ def gate_steps(
         learn(s, seen, contradicts, own, v, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
-    return GateSteps(step, taking_out(refuse, SIGNAL))
+    judges, take_out = _each_lane(step), outlined(_each_lane(taking_out(refuse, SIGNAL)), short=True)
+    judge_all = judges if curved else outlined(judges)
+
+    @kernel
+    def decide(s: State) -> None:
+        refused = 0
+        for l in range(s.reason.shape[0]):
+            s.reason[l] = ages
+        judge_all(s)
+        for l in range(s.reason.shape[0]):
+            refused = max(refused, s.reason[l])
+        if refused > 0:
+            take_out(s)
+
+    return decide

@@ -61,12 +61,9 @@ def notice_one(s: State, j: int, away: float, l: int) -> None:
             widen(s, j, u, u, l)
 
 
-def input_rules(
-    gate: Any,
-) -> tuple[Callable[[State, int, bool, int], None], Callable[[State, bool, bool, int], int]]:
-    """``notice(s, ages, known, l)``, which takes in the inputs of a sample of a model that remembers those of ``ages``
-    samples besides it, and ``blame(s, contradicts, usual, l)``: the number, from 1, of the first input that is blamed
-    for the sample, or 0.
+def input_rules(gate: Any) -> tuple[Any, Any]:
+    """``notice(s, ages, known, l)``, which takes in the inputs of a sample if the model remembers those of ``ages``
+    others, and ``blame(s, contradicts, usual, l)``, the number of the first input that is blamed for it, from 1, or 0.
     """
     away, trust = float(gate.away), gate.trust
 
@@ -96,9 +93,7 @@ def input_rules(
 
 
 def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Step:
-    """``take_out(s, l)``: inputs that were outside become missing in the model's memory, by its ``refuse``, if the
-    reason of the sample, from ``blamed`` on, is one of them.
-    """
+    """``take_out(s, l)``: the model refuses inputs that were outside, if the reason is one, from ``blamed`` on."""
 
     @kernel
     def take_out(s: State, l: int) -> None:

@@ -64,10 +64,10 @@ def as_measured(s: State, l: int) -> float:
 
 
 @kernel
-def repeats_last(s: State, l: int) -> bool:
-    """Whether the reading repeats the one before in all digits, but for the rounding of a shift."""
+def same_reading(s: State, other: float, l: int) -> bool:
+    """Whether the reading is another one but for rounding, also that of the shift; not if the other is NaN."""
     y = as_measured(s, l)
-    return abs(y - s.gate_before[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
+    return abs(y - other) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
 
 
 def repeats_by_nature(share: float) -> Callable[[State, int], bool]:
@@ -91,7 +91,7 @@ def resolution(share: float) -> Step:
     def resolve(s: State, l: int) -> None:
         if s.observed[l] > 0.0:
             step, finest = abs(as_measured(s, l) - s.gate_before[l]), s.gate_finest[l]
-            if repeats_last(s, l):
+            if same_reading(s, s.gate_before[l], l):
                 s.gate_repeats[l] += 1.0
             elif step > 0.0:  # NaN at the first reading
                 s.gate_steps[l] += 1.0
@@ -118,7 +118,7 @@ def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
 
     @kernel
     def frozen(s: State, v: float, l: int) -> bool:
-        found, repeats = 0.0, repeats_last(s, l)
+        found, repeats = 0.0, same_reading(s, s.gate_before[l], l)
         if repeats & (s.gate_stuck[l] < 0.0):
             found = BELIEVED
         elif repeats & (s.gate_steps[l] >= 2.0 * ENOUGH):

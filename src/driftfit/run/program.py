@@ -26,7 +26,7 @@ from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, outpu
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.readings.first_samples import First, replayed
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, foreseeing, gate_steps
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, foreseeing, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
 from driftfit.run.gating import gate_of, without_start
@@ -230,7 +230,8 @@ class Program:
             else:
                 foresee = None if self.tracker.output_error else foreseeing(model, own)
                 implicit, lends = self.model.implicit is not None, not self.tracker.covariance
-                found = drivers(model, own, keep, gate_steps(self.gate, model.refuse, implicit, lends, foresee))
+                given = model.ages, model.refuse, implicit, lends, foresee
+                found = drivers(model, own, keep, gate_step(self.gate, *given))
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
         return found

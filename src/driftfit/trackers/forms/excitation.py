@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.forms.resolution import reading
+from driftfit.readings.repeats import as_measured
 
 MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
@@ -76,7 +76,7 @@ def bounded(square: float, mean: float, count: float) -> float:
 def learn_scales(s: State, l: int) -> None:
     """Update the mean squares of the regressors, over excited samples, and of y, in units of the noise factor."""
     s.power_samples[l] += s.ok[l]
-    y = reading(s, l)
+    y = as_measured(s, l)
     square = bounded(y * y / s.noise[l], s.power[l], s.power_samples[l])
     active = s.ok[l] if square > DULL * s.power[l] else 0.0
     s.power[l] += active * (square - s.power[l]) / min(max(s.power_samples[l], 1.0), MEMORY)

@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.readings.repeats import as_measured, same_reading
 
 SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
@@ -61,19 +61,6 @@ def unresolved() -> dict[str, Any]:
 
 
 @kernel
-def reading(s: State, l: int) -> float:
-    """The output as it was measured."""
-    return s.y[l] + s.shift[l]  # type: ignore[no-any-return]
-
-
-@kernel
-def same_reading(s: State, other: float, l: int) -> bool:
-    """Whether the reading is another one but for rounding, also that of the shift; not if the other is NaN."""
-    y = reading(s, l)
-    return abs(y - other) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
-
-
-@kernel
 def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
     """Count a step among those of the grid, smaller and larger ones; ``moved`` is 0 if there is none.
 
@@ -97,7 +84,7 @@ def learn_grid(s: State, y: float, step: float, moved: float, l: int) -> None:
 @kernel
 def resolve(s: State, l: int) -> None:
     """Process a reading."""
-    y, observed, finest = reading(s, l), s.observed[l], s.finest[l]
+    y, observed, finest = as_measured(s, l), s.observed[l], s.finest[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
     repeated = observed if same_reading(s, s.reading[l], l) else 0.0
     moved = observed - repeated if step >= 0.0 else 0.0
