@@ -37,7 +37,7 @@ from driftfit import AdaptiveKalman, Bank, Sensor
 from driftfit.trackers.base import Tracker
 
 HEADS = ("ratio", "step", "moving", "still", "output")
-QUICK_PIECE = "single ladders"
+QUICK, QUICK_PIECE = ("common_walk",), "single ladders"
 TRACKERS: dict[str, Tracker] = {
     "default": AdaptiveKalman(),
     "bank": Bank(),
@@ -101,7 +101,7 @@ class Bench:
 
     def __init__(self, given: argparse.Namespace, kept: Kept) -> None:
         self.kept, self.against = kept, given.against
-        self.names = (given.only or tuple(scenarios()))[: 1 if given.quick else None]
+        self.names = (given.only or (QUICK if given.quick else tuple(scenarios())))[: 1 if given.quick else None]
         self.seeds = range(1 if given.quick else given.seeds)
         self.series = real.read(given.data) if given.data else {}
 
