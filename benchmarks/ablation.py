@@ -38,7 +38,7 @@ from driftfit import AdaptiveKalman, Bank, Sensor
 from driftfit.trackers.base import Tracker
 
 HEADS = ("ratio", "step", "moving", "still", "output", "ahead", "width")
-QUICK, QUICK_PIECE = ("common_walk", "single_walk", "two_jumps"), "single ladders"
+QUICK, QUICK_PIECE = ("common_walk",), "single ladders"
 TRACKERS: dict[str, Tracker] = {
     "default": AdaptiveKalman(),
     "bank": Bank(),

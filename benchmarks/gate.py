@@ -173,8 +173,8 @@ def model_of(na: int, nb: int, m: int, intercept: bool) -> tuple[Callable, Calla
 
 
 @kernel
-def nothing(s, l):
-    s.reason[l] = 0
+def nothing(s):
+    s.reason[0] = 0
 
 
 def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
@@ -190,7 +190,7 @@ def loop_of(regress: Callable, push: Callable, gate: Callable) -> Callable:
             forecast(s, l)
             variance(s, l)
             errors[t, 0], errors[t, 1] = s.e[l], s.s[l]
-            gate(s, l)
+            gate(s)
             variance(s, l)
             correct(s, l)
             push(s, l)
@@ -228,13 +228,13 @@ class Bench:
 
     def __post_init__(self) -> None:
         regress, push, refuse, self.n, ages = model_of(self.na, self.nb, self.m, self.intercept)
-        self.gated = loop_of(regress, push, gate_step(self.gate, self.n, self.m, ages, refuse))
+        self.gated = loop_of(regress, push, gate_step(self.gate, ages, refuse))
         self.plain = loop_of(regress, push, nothing)
 
     def run(self, kind: int, y: np.ndarray, u: np.ndarray, gated: bool, q: float, r: float) -> Result:
         """The whole record, and first samples once more if they had codes."""
         own = fields(self.n, self.m, self.na, self.nb, kind, self.gate, q, r)
-        own["scale"] = r if kind == KALMAN else 1.0
+        own["scale"], own["raw_e"] = r if kind == KALMAN else 1.0, np.nan
         tile, loop = tile_of(own), self.gated if gated else self.plain
         result = Result(np.zeros((len(y), self.n)), np.zeros(len(y), np.int64), np.zeros((len(y), 2)), tile)
         out = result.theta, result.reason, result.errors

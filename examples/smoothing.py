@@ -14,7 +14,7 @@ from rich.table import Table
 from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, augmented, huber, total_variation, track, tune
 
 BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
-SEEDS = 20
+SEEDS = 10
 TWO = Regression(["gain", "offset"])
 
 

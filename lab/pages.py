@@ -36,7 +36,7 @@ CLOCKS = re.compile(
 )
 SAMPLED = (
     "coarse_coverage", "coverage_of_models", "curved_outputs", "diagnose_constancy", "event_dates",
-    "smoothing_coverage",
+    "jump_control", "smoothing_coverage",
 )  # fmt: skip
 """Benchmarks of which ``--quick`` prints rows of the page, in a few seconds; others have fewer records then."""
 

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from driftfit.cli.program import helpful
 from driftfit.engine.settings import near
-from lab import budgets, pages, same_numbers, structure
+from lab import budgets, faults, pages, same_numbers, structure
 from lab.bench import commands as bench
 from lab.bounds.commands import bounds
 from lab.reproduce import found as reproductions
@@ -27,6 +27,7 @@ app.add_typer(
 )
 app.command(name="structure")(structure.show)
 app.command(name="budgets")(budgets.show)
+app.command(name="faults")(faults.show)
 app.command(name="pages")(pages.show)
 app.command(name="bounds")(bounds)
 out = Console(highlight=False)

@@ -22,9 +22,9 @@ def test_a_gain_that_changes_is_followed_in_raw_units():
     """Its drift was smaller by 1 + (offset / deviation)^2, so that it took 700 samples at 60 deviations, and bands of
     the gain covered 40 % of the truth, those of the smoother nothing."""
     errors = []
-    for offset in (0.0, 60.0, 1e4, 1e11):
+    for offset in (0.0, 60.0, 1e11):
         inside, smoothed, squares = [], [], []
-        for seed in range(5):
+        for seed in range(3):
             y, u, gain = regression(seed, offset)
             run = track(Regression(["u"], intercept=True), AdaptiveKalman(), y, u)
             path = run.smooth()
@@ -35,7 +35,7 @@ def test_a_gain_that_changes_is_followed_in_raw_units():
         assert np.median(smoothed) > 0.93
         errors.append(np.sqrt(np.mean(squares)))
     assert errors[1] < 1.06 * errors[0]
-    assert errors[2:] == pytest.approx([errors[1]] * 2, rel=2e-3)
+    assert errors[2] == pytest.approx(errors[1], rel=2e-3)
 
 
 def test_walks_of_all_gains_of_an_autoregression_in_raw_units():
@@ -50,23 +50,20 @@ def test_walks_of_all_gains_of_an_autoregression_in_raw_units():
     assert raw < 1.15 * plain  # 2.1 times without drifts about the means
 
 
-def test_an_intercept_of_another_size_is_the_same_model():
+def test_the_smoother_is_one_in_the_models_regressors_whatever_the_size_of_the_constant():
     """The constant column may have any value, and need not be the model's own."""
     y, u, _ = regression(0, 30.0)
     one = track(Regression(["u"], intercept=True), AdaptiveKalman(), y, u)
-    other = track(Regression(["u", "one"]), AdaptiveKalman(), y, np.column_stack([u, np.full(T, 250.0)]))
-    np.testing.assert_allclose(other.theta[20:, 0], one.theta[20:, 0], rtol=1e-6)
-    np.testing.assert_allclose(other.smooth().theta[:, 1] * 250.0, one.smooth().theta[:, 1], rtol=1e-5)
-
-
-def test_covariances_of_the_smoother_are_those_of_the_models_own_parameters():
-    y, u, _ = regression(0, 30.0)
-    run = track(Regression(["u"], intercept=True), AdaptiveKalman(), y, u)
-    path = run.smooth(keep="cov")
+    path = one.smooth(keep="cov")
+    np.testing.assert_array_equal(path.walk.phi, np.column_stack([u, np.ones(T)]))
+    np.testing.assert_allclose(path.walk.residual(path.theta), path.residual, atol=1e-9)
     phi = np.array([u[100], 1.0])
     np.testing.assert_allclose(np.sqrt(np.diag(path.cov(100))), path.std[100], rtol=1e-12)
     assert path.std[100, 1] > 10.0 * np.sqrt(phi @ path.cov(100) @ phi)  # far from u = 0 the fit is known best
-    np.testing.assert_allclose(run.smooth().std, path.std, rtol=1e-12)
+    np.testing.assert_allclose(one.smooth().std, path.std, rtol=1e-12)
+    other = track(Regression(["u", "one"]), AdaptiveKalman(), y, np.column_stack([u, np.full(T, 250.0)]))
+    np.testing.assert_allclose(other.theta[20:, 0], one.theta[20:, 0], rtol=1e-6)
+    np.testing.assert_allclose(other.smooth().theta[:, 1] * 250.0, path.theta[:, 1], rtol=1e-5)
 
 
 def test_the_smoother_of_inputs_far_from_zero_does_not_follow_the_noise_without_an_intercept():
@@ -78,18 +75,10 @@ def test_the_smoother_of_inputs_far_from_zero_does_not_follow_the_noise_without_
     assert (np.abs(path.theta - [1.0, 0.5]) < 3.0 * path.std).all()
 
 
-def test_the_problem_of_the_smoother_is_one_in_the_models_regressors():
-    y, u, _ = regression(0, 30.0)
-    path = track(Regression(["u"], intercept=True), AdaptiveKalman(), y, u).smooth()
-    np.testing.assert_array_equal(path.walk.phi, np.column_stack([u, np.ones(T)]))
-    np.testing.assert_allclose(path.walk.residual(path.theta), path.residual, atol=1e-9)
-
-
-@pytest.mark.parametrize("colour", [0.0, 0.7])
-def test_a_second_constant_column_is_not_determined(colour):
-    """Less its mean it is nothing but rounding."""
+def test_a_second_constant_column_is_not_determined():
+    """Less its mean it is nothing but rounding, in coloured noise too."""
     rng = np.random.default_rng(2)
-    u, noise = rng.normal(size=T), lfilter([1.0], [1.0, -colour], 0.1 * rng.normal(size=T))
+    u, noise = rng.normal(size=T), lfilter([1.0], [1.0, -0.7], 0.1 * rng.normal(size=T))
     phi = np.column_stack([np.full(T, 7.3), u, np.ones(T)])
     with pytest.warns(UserWarning, match="could not be learned"):
         path = track(Regression(3), AdaptiveKalman(), 8.3 + u + noise, phi).smooth()

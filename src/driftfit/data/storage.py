@@ -312,6 +312,6 @@ def restore(
         field[...] = stored
 
 
-def fields(tile: Array) -> list[str]:
+def fields(tile: Array) -> tuple[str, ...]:
     """Names of the fields that contain state."""
     return held_in(tile.dtype)

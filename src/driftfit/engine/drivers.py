@@ -23,7 +23,7 @@ from numba import types
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import advancing, judging, learning, looking
+from driftfit.engine.phases import advancing, learning, looking
 from driftfit.engine.tiles import as_compiled, kind_of, tile_type
 from driftfit.engine.tracker_part import tracker_part, whole_record
 
@@ -229,7 +229,7 @@ def one_or_all(u: Array) -> Any:
 
 
 @lru_cache(maxsize=256)
-def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Step | None = None) -> Drivers:
+def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: Any = None) -> Drivers:
     """Build the drivers of a (model, tracker) pair, with a ``gate`` between forecast and correction or without.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
@@ -248,7 +248,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: S
     part = whole_record if tracker.reads_model else tracker_part
     phases: tuple[Any, ...] = looking(tracker), learning(tracker)
     phases = tuple(map(outlined, phases)) if tracker.outlined else phases if gate else (advancing(tracker),)
-    sample = _sample(model, tracker.note, phases, gate and judging(gate, model), part)
+    sample = _sample(model, tracker.note, phases, gate, part)
     keep_more = covariance if keep == "cov" else nothing_more
     store = tracker.store if gate is None or keep == "own" else stored_too(tracker.store, store_decision)
     run = _run(sample, tracker.read_extra, _written(keep != "own", store, keep_more, part), part, gate is not None)

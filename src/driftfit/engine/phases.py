@@ -62,11 +62,23 @@ def _late(tracker: Any) -> Any:
     return kernel(late, inline=False)
 
 
-def _wide_samples(tracker: Any) -> tuple[bool, Step, Any]:
-    """Whether the start takes in what a covariance cannot, the step that finds it, and the one that takes it in."""
+def _wide_samples(tracker: Any) -> tuple[bool, Step, Any, Any]:
+    """Whether the start takes in what a covariance cannot, the step that finds it, the one that takes it in, and that
+    one if any lane has such a sample."""
     if tracker.start is None or tracker.start.take_over is None:
-        return False, nothing, nothing
-    return True, keeps_digits, _late(tracker)
+        return False, nothing, nothing, nothing
+    late = _late(tracker)
+    called = late if tracker.outlined else outlined(late, short=True)
+
+    @kernel
+    def where_late(s: State) -> None:
+        some = 0.0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.late[l])
+        if some > 0.0:
+            called(s)
+
+    return True, keeps_digits, late, where_late
 
 
 @kernel
@@ -140,51 +152,40 @@ def _with_start(usual: Any, tracker: Any, first: Step | None, other: Step, after
 
 def advancing(tracker: Any) -> Any:
     """One sample of all lanes of a tile; lanes whose ``s.root`` is 1 take the steps of the ``start``."""
-    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
-    correct, report = tracker.correct, tracker.report
-    both, check, late = _wide_samples(tracker)
-    called = outlined(late, short=True)
+    forecasts, correct, report = forecasting(tracker), tracker.correct, tracker.report
+    both, check, late, where_late = _wide_samples(tracker)
 
     @kernel
     def advance(s: State) -> None:
         for l in range(s.theta.shape[1]):
-            predict(s, l)
-            forecast(s, l)
-            variance(s, l)
+            forecasts(s, l)
             check(s, l)
             correct(s, l)
         for l in range(s.theta.shape[1]):
             report(s, l)
         if both:  # a constant
-            some = 0.0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.late[l])
-            if some > 0.0:
-                called(s)
+            where_late(s)
 
     first = tracker.start and _corrected(forecasting(tracker.start), tracker.start, taken_in)
-    other = _corrected(forecasting(tracker), tracker, check)
+    other = _corrected(forecasts, tracker, check)
     return _with_start(advance, tracker, first, other, late if both else None)
 
 
 def looking(tracker: Any) -> Any:
     """Time update and forecast of all lanes, before a gate."""
-    predict, forecast, variance = tracker.predict, tracker.forecast, tracker.variance
+    forecasts = forecasting(tracker)
 
     @kernel
     def look(s: State) -> None:
         for l in range(s.theta.shape[1]):
-            predict(s, l)
-            forecast(s, l)
-            variance(s, l)
+            forecasts(s, l)
 
-    return _with_start(look, tracker, tracker.start and forecasting(tracker.start), forecasting(tracker))
+    return _with_start(look, tracker, tracker.start and forecasting(tracker.start), forecasts)
 
 
 def learning(tracker: Any) -> Any:
     """Correction of all lanes, and reports, after a gate, which may have raised the noise and the floor of r."""
-    both, check, late = _wide_samples(tracker)
-    called = late if tracker.outlined else outlined(late, short=True)
+    both, check, late, where_late = _wide_samples(tracker)
     usual = _corrected(tracker.variance, tracker, check, tracker.learns_scale)
 
     @kernel
@@ -192,23 +193,7 @@ def learning(tracker: Any) -> Any:
         for l in range(s.theta.shape[1]):
             usual(s, l)
         if both:  # a constant
-            some = 0.0
-            for l in range(s.theta.shape[1]):
-                some = max(some, s.late[l])
-            if some > 0.0:
-                called(s)
+            where_late(s)
 
     first = tracker.start and _corrected(tracker.start.variance, tracker.start, taken_in, tracker.learns_scale)
     return _with_start(learn, tracker, first, usual, late if both else None)
-
-
-def judging(gate: Step, model: Any) -> Any:
-    """The gate between ``looking`` and ``learning``, which sees the inputs and the memory of the model too."""
-
-    @partial(kernel, inline=False)
-    def judge(s: State) -> None:
-        for l in range(s.theta.shape[1]):
-            s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
-            gate(s, l)
-
-    return judge if model.foreseeing else outlined(judge)

@@ -12,7 +12,7 @@ form of the tracker; and ``used_noise``, which only the replay for a smoother wr
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -45,12 +45,13 @@ def _common(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def held_in(record: np.dtype[Any], own: Collection[str] = ()) -> list[str]:
+@lru_cache
+def held_in(record: np.dtype[Any], own: tuple[str, ...] = ()) -> tuple[str, ...]:
     """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
     first, second, *rest = _common(0)
     behind = [first, second, "u", *rest, *OPEN]
     names = [name for name in record.names or () if name not in (BOUNDARY, "padding")]
-    return sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name))
+    return tuple(sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name)))
 
 
 def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:

@@ -26,13 +26,13 @@ Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, Step, kernel
+from driftfit.engine.kernel import State, kernel
 
 OUTLYING = 10.0
 """Usual distances from the median from which on a value is outlying."""
@@ -93,7 +93,7 @@ def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> fl
 
 
 @kernel
-def doubt(s: State, implicit: bool, l: int) -> bool:
+def judge_each(s: State, implicit: bool, l: int) -> bool:
     """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0; whether there is such a one."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
@@ -192,7 +192,7 @@ def comes_again(s: State, l: int) -> bool:
 def decide(s: State, ages: int, implicit: bool, l: int) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
     dropped, s.gate_decided[l] = -s.gate_decided[l], 1
-    some = doubt(s, implicit, l)
+    some = judge_each(s, implicit, l)
     whole = (dropped == 0) | (s.gate_doubt[0, l] == 1.0) & (not comes_again(s, l))
     if some & whole and contradicted(s, l):
         mark(s, ages, l)
@@ -200,7 +200,7 @@ def decide(s: State, ages: int, implicit: bool, l: int) -> None:
 
 
 @kernel
-def repeats(s: State, k: int, l: int) -> bool:
+def comes_once_more(s: State, k: int, l: int) -> bool:
     """Whether the present sample is that kept as number k once more."""
     n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
     same = (reading_now(s, l) == s.gate_first[k, READING, l]) & (s.dt[l] == s.gate_first[k, DT, l])
@@ -229,7 +229,7 @@ def keep(s: State, k: int, times: float, l: int) -> None:
 def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
     N = s.gate_first.shape[0]
     last = s.gate_kept[l] - 1
-    if last >= 0 and repeats(s, last, l):
+    if last >= 0 and comes_once_more(s, last, l):
         keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
         return
     if s.gate_kept[l] == N:
@@ -247,11 +247,11 @@ def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
         decide(s, ages, implicit, l)
 
 
-def first_samples(ages: int, implicit: bool = False) -> Step:
-    """``remember(s, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
+def first_samples(implicit: bool) -> Callable[[State, int, int], None]:
+    """``remember(s, ages, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
 
     @kernel
-    def remember(s: State, l: int) -> None:
+    def remember(s: State, ages: int, l: int) -> None:
         if s.gate_decided[l] < 1:
             remember_one(s, ages, implicit, l)
 

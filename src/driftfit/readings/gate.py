@@ -33,15 +33,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import State, Step, kernel, nothing
+from driftfit.engine.outlined import outlined
 from driftfit.engine.settings import Settings, numbers, whole
 from driftfit.readings.first_samples import first_samples, no_samples
-from driftfit.readings.inputs import input_rules, no_inputs
+from driftfit.readings.inputs import input_rules, no_inputs, taking_out
 from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unresolved
 
 FIRST = 10.0
@@ -179,20 +180,29 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     return judge  # type: ignore[no-any-return]
 
 
+def _each_lane(step: Step) -> Any:
+    @partial(kernel, inline=False)
+    def each(s: State) -> None:
+        for l in range(s.reason.shape[0]):
+            step(s, l)
+
+    return each
+
+
 @lru_cache(maxsize=256)
 def gate_step(
-    gate: Gate, n: int, m: int, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False,
-    lends: bool = False, foresee: Step | None = None,
-) -> Step:  # fmt: skip
-    """The gate of a model with n parameters and m inputs, of which it remembers ``ages`` samples besides the present.
+    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
+    foresee: Step | None = None,
+) -> Any:  # fmt: skip
+    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
 
-    ``refuse(s, signal, age, l)`` is the model's: input ``signal``, read ``age`` samples ago, becomes missing in its
-    memory. The regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be
-    as large as predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends``
-    the mean of e^2 takes the place of s, which the tracker does not have.
+    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
+    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
+    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
+    e^2 takes the place of s, which the tracker does not have.
     """
-    remember = first_samples(ages, implicit)
-    notice, blame = input_rules(gate, ages, refuse)
+    remember = first_samples(implicit)
+    notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
@@ -201,10 +211,11 @@ def gate_step(
 
     @kernel
     def step(s: State, l: int) -> None:
-        s.reason[l] = USED
+        ages, s.reason[l] = s.reason[l], USED
+        s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
         seen = s.observed[l] > 0.0
-        remember(s, l)
-        notice(s, s.gate_count[l] >= FIRST, l)
+        remember(s, ages, l)
+        notice(s, ages, s.gate_count[l] >= FIRST, l)
         off, y_hat, e, variance = measured(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
         if curved and off * off > far * s.gate_variance[l]:
             look(s, l)
@@ -224,4 +235,18 @@ def gate_step(
         learn(s, seen, contradicts, own, v, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
-    return step  # type: ignore[no-any-return]
+    judges, take_out = _each_lane(step), outlined(_each_lane(taking_out(refuse, SIGNAL)), short=True)
+    judge_all = judges if curved else outlined(judges)
+
+    @kernel
+    def decide(s: State) -> None:
+        refused = 0
+        for l in range(s.reason.shape[0]):
+            s.reason[l] = ages
+        judge_all(s)
+        for l in range(s.reason.shape[0]):
+            refused = max(refused, s.reason[l])
+        if refused > 0:
+            take_out(s)
+
+    return decide

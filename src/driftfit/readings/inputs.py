@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import State, Step, kernel
 
 LONGEST = 60
 """Samples that a mask of 64 bits can hold."""
@@ -46,25 +46,22 @@ def widen(s: State, j: int, u: float, l: int) -> None:
     s.gate_low[j, l], s.gate_high[j, l] = min(s.gate_low[j, l], u), max(s.gate_high[j, l], u)
 
 
-def input_rules(
-    gate: Any, ages: int, refuse: Callable[[State, int, int, int], None]
-) -> tuple[Callable[[State, bool, int], None], Callable[[State, bool, bool, int], int]]:
-    """``notice(s, known, l)``, which takes in the inputs of a sample, and ``blame(s, contradicts, usual, l)``, the
-    number of the first input that is blamed for it, from 1, or 0, of a model that remembers the inputs of ``ages``
-    samples besides the present."""
-    away, trust, ages = float(gate.away), gate.trust, min(ages, LONGEST)
-    all_ages = (1 << (ages + 1)) - 1
+def input_rules(gate: Any) -> tuple[Any, Any]:
+    """``notice(s, ages, known, l)``, which takes in the inputs of a sample if the model remembers those of ``ages``
+    others, and ``blame(s, contradicts, usual, l)``, the number of the first input that is blamed for it, from 1, or 0.
+    """
+    away, trust = float(gate.away), gate.trust
 
     @kernel
-    def notice(s: State, known: bool, l: int) -> None:
+    def notice(s: State, ages: int, known: bool, l: int) -> None:
         for j in range(s.gate_low.shape[0]):
-            if (s.gate_outside[j, l] >> ages) & 1 > 0:  # leaves the memory without blame
+            if (s.gate_outside[j, l] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
                 widen(s, j, s.gate_lowest[j, l], l)
                 widen(s, j, s.gate_highest[j, l], l)
                 forget(s, j, l)
             u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
             strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
-            s.gate_outside[j, l] = ((s.gate_outside[j, l] << 1) & all_ages) | (1 if strange else 0)
+            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) | (1 if strange else 0)
             if strange:
                 s.gate_lowest[j, l], s.gate_highest[j, l] = min(s.gate_lowest[j, l], u), max(s.gate_highest[j, l], u)
             elif abs(u) < np.inf:
@@ -81,11 +78,21 @@ def input_rules(
         if not (contradicts & usual & (s.gate_blamed[l] < trust)):
             return 0
         s.gate_blamed[l] += 1
-        for j in range(s.gate_low.shape[0]):
-            for age in range(ages, -1, -1):
-                if (s.gate_outside[j, l] >> age) & 1 > 0:
-                    refuse(s, j, age, l)
-            forget(s, j, l)
         return first
 
     return notice, blame
+
+
+def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Step:
+    """``take_out(s, l)``: the model refuses inputs that were outside, if the reason is one, from ``blamed`` on."""
+
+    @kernel
+    def take_out(s: State, l: int) -> None:
+        if s.reason[l] >= blamed:
+            for j in range(s.gate_low.shape[0]):
+                for age in range(LONGEST, -1, -1):
+                    if (s.gate_outside[j, l] >> age) & 1 > 0:
+                        refuse(s, j, age, l)
+                forget(s, j, l)
+
+    return take_out  # type: ignore[no-any-return]

@@ -201,7 +201,7 @@ class Program:
             "gate": None if self.gate is None else self.gate.settings(),
         }
         record = self.tile().dtype
-        return Layout(record, held_in(record, self.tracker_start), self.scratch, owner)
+        return Layout(record, held_in(record, tuple(self.tracker_start)), self.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.layout`)."""
@@ -229,8 +229,8 @@ class Program:
             else:
                 foresee = None if self.tracker.output_error else foreseeing(model, own)
                 implicit, lends = self.model.implicit is not None, not self.tracker.covariance
-                given = self.model.n, self.model.m, model.ages, model.refuse, implicit, lends
-                found = drivers(model, own, keep, gate_step(self.gate, *given, foresee))
+                given = model.ages, model.refuse, implicit, lends, foresee
+                found = drivers(model, own, keep, gate_step(self.gate, *given))
                 found = found._replace(run=partial(self._decided, found.run))
             self._drivers[keep, steps] = found
         return found

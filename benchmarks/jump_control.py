@@ -5,9 +5,10 @@
 `Live.control` plans one sample ahead from the mean and covariance of the mixture of all hypotheses; the PI controller
 has the settings that are best for it on these runs. Prints the mean squared tracking error, overall and within 15
 samples of a jump: for a gain that jumps while the reference is constant, and for one that jumps in the same sample as
-the reference. Run: python examples/jump_control.py
+the reference. Run: python benchmarks/jump_control.py [--quick, a row]
 """
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -20,6 +21,14 @@ NOISE, T, RUNS, LIMIT = 0.1, 180, 20, 10.0
 CHANGES, KNOWN = [Change(1e-6), Change(1.0, prob=0.01, which=[1], name="gain")], [Sensor.nominal(NOISE**2)]
 BANK, MERGED = Bank(CHANGES, KNOWN, p0=1.0), Bank(CHANGES, KNOWN, reduce=GPB(2), p0=1.0)
 KALMAN = Kalman(q=[1e-6, 0.01], r=NOISE**2, p0=1.0)
+LAWS: dict[str, Any] = {
+    "Kalman, cautious": (KALMAN, {}),
+    "bank, certain": (BANK, {"caution": 0.0}),
+    "bank, cautious": (BANK, {}),
+    "bank, probing": (BANK, {"probe": 0.2}),
+    "GPB(2), cautious": (MERGED, {}),
+    "default, cautious": (AdaptiveKalman(), {}),
+}
 Law = Callable[[float, float], float]
 
 
@@ -73,30 +82,28 @@ def parts(make: Callable[[], Law], late: int) -> list[float]:
     return [float(found[:, part].mean()) for part in (known, near, known & ~near)]
 
 
+def line(name: str, found: list[float]) -> None:
+    print(f"{name:<22}" + "".join(f"{value:>12.3f}" for value in found))
+
+
 def table(late: int) -> None:
     grid = [partial(pi, P, I) for P in (0.2, 0.3, 0.4, 0.5) for I in (0.02, 0.05, 0.1, 0.2)]
-    best = min((parts(make, late) for make in grid), key=lambda found: found[0])
-    print(f"{'PI, best settings':<22}" + "".join(f"{value:>12.3f}" for value in best))
-    for name, tracker, how in (
-        ("Kalman, cautious", KALMAN, {}),
-        ("bank, certain", BANK, {"caution": 0.0}),
-        ("bank, cautious", BANK, {}),
-        ("bank, probing", BANK, {"probe": 0.2}),
-        ("GPB(2), cautious", MERGED, {}),
-        ("default, cautious", AdaptiveKalman(), {}),
-    ):
-        found = parts(partial(adaptive, tracker, **how), late)
-        print(f"{name:<22}" + "".join(f"{value:>12.3f}" for value in found))
+    line("PI, best settings", min((parts(make, late) for make in grid), key=lambda found: found[0]))
+    for name, (tracker, how) in LAWS.items():
+        line(name, parts(partial(adaptive, tracker, **how), late))
 
 
-def main() -> None:
+def main(quick: bool = False) -> None:
     heads = "all    after jumps   otherwise"
     print(f"the gain jumps alone        {heads}")
+    if quick:
+        line("Kalman, cautious", parts(partial(adaptive, KALMAN), 7))
+        return
     table(7)
     print(f"\nwith the reference          {heads}")
     table(0)
-    print(f"{'least possible':<22}" + f"{NOISE**2:>12.3f}" * 3)
+    line("least possible", [NOISE**2] * 3)
 
 
 if __name__ == "__main__":
-    main()
+    main("--quick" in sys.argv)
