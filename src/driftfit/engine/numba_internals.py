@@ -38,7 +38,6 @@ from weakref import ref
 
 import llvmlite.binding as llvm
 import numba
-from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
@@ -306,9 +305,10 @@ def at_level_two() -> Iterator[None]:
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
 # all memory that a compilation left behind. Builders of passes leave 2 kB each; they must not be kept for a second run
 # though: every run adds observers to its builder that end with the run, and each of them delays all later passes.
-for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
-    if _manager._dispose is passes.ffi.ObjectRef._dispose:
-        _manager._dispose = passes.NewPassManager._dispose
+_passes = llvm.newpassmanagers
+for _manager in (_passes.ModulePassManager, _passes.FunctionPassManager):
+    if _manager._dispose is _passes.ffi.ObjectRef._dispose:
+        _manager._dispose = _passes.NewPassManager._dispose
 
 _recent: OrderedDict[Any, None] = OrderedDict()
 """(dispatcher, types of arguments) of functions that were compiled only to be linked, the most recently used last."""
