@@ -305,10 +305,10 @@ def at_level_two() -> Iterator[None]:
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
 # all memory that a compilation left behind. Builders of passes leave 2 kB each; they must not be kept for a second run
 # though: every run adds observers to its builder that end with the run, and each of them delays all later passes.
-_passes = llvm.newpassmanagers
-for _manager in (_passes.ModulePassManager, _passes.FunctionPassManager):
-    if _manager._dispose is _passes.ffi.ObjectRef._dispose:
-        _manager._dispose = _passes.NewPassManager._dispose
+passes = llvm.newpassmanagers
+for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
+    if _manager._dispose is passes.ffi.ObjectRef._dispose:
+        _manager._dispose = passes.NewPassManager._dispose
 
 _recent: OrderedDict[Any, None] = OrderedDict()
 """(dispatcher, types of arguments) of functions that were compiled only to be linked, the most recently used last."""
