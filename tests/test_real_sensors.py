@@ -175,7 +175,7 @@ def test_noise_that_grows_thirtyfold_is_followed():
 @pytest.mark.parametrize("kind", ["regression", "arx"])
 def test_smoothed_bands_hold_where_the_truth_walks(kind):
     model, inside, better = {"regression": MODEL, "arx": PLANT}[kind], [], []
-    for seed in range(5):
+    for seed in range(10):
         for name in ("slow_walk", "fast_walk"):
             simulated = scenarios.simulate(name, kind, seed)
             run = track(model, AdaptiveKalman(), simulated.y, simulated.u)
