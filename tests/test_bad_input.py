@@ -7,7 +7,6 @@ import polars as pl
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, DataWarning, Kalman, Live, Regression, track
-from driftfit.trackers import found
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 KINDS = [TRACKER, RLS(0.99), AugmentedFLS(mu=1.0)]
@@ -212,7 +211,3 @@ def test_a_cut_csv_line_is_missing_not_fatal(tmp_path):
     (tmp_path / "cut.csv").write_text("flow,u\n1.0,2.0\n1.5,3.0\n2.0")
     run = track(MODEL, TRACKER, "flow", "u", data=tmp_path / "cut.csv")
     assert np.isnan(run.u[2, 0])
-
-
-def test_every_tracker_is_covered_by_some_kind():
-    assert {type(kind).__name__ for kind in KINDS} <= set(found())

@@ -25,7 +25,6 @@ from lab.bench import (
 from lab.bench.computer import installed
 from lab.bench.contest import Contest, Finish, Job, hold
 from lab.bench.records import Outcome, Record, regressors, simulated
-from lab.bench.speed_peers import Signals
 from lab.bench.speed_process import Start, needed
 from lab.program import app
 
@@ -246,12 +245,6 @@ def test_what_a_package_needs():
     pytest.importorskip("packaging")
     assert {"driftfit", "numba", "llvmlite", "polars"} <= needed("driftfit")
     assert "numpy" not in needed("driftfit")
-
-
-def test_signals_keep_their_first_part():
-    data = speed.signals(30)
-    assert isinstance(data.first(10), Signals)
-    np.testing.assert_array_equal(data.first(10).phi, data.phi[:10])
 
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -38,7 +38,6 @@ from weakref import ref
 
 import llvmlite.binding as llvm
 import numba
-from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
@@ -306,6 +305,7 @@ def at_level_two() -> Iterator[None]:
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
 # all memory that a compilation left behind. Builders of passes leave 2 kB each; they must not be kept for a second run
 # though: every run adds observers to its builder that end with the run, and each of them delays all later passes.
+passes = llvm.newpassmanagers
 for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
     if _manager._dispose is passes.ffi.ObjectRef._dispose:
         _manager._dispose = passes.NewPassManager._dispose

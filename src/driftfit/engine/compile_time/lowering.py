@@ -20,9 +20,8 @@ import math
 from functools import reduce
 from typing import Any, NamedTuple
 
-from llvmlite.ir import Constant
 from numba import types
-from numba.core import cgutils, ir
+from numba.core import ir
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
@@ -31,7 +30,7 @@ from numba.core.transforms import canonicalize_cfg
 from numba.core.typed_passes import NativeLowering
 from numba.np.arrayobj import fix_integer_index, load_item, store_item
 
-from driftfit.engine.compile_time.open_record import OpenRecord, beginning, lengths, tell_fields_apart
+from driftfit.engine.compile_time.open_record import OpenRecord, beginning, cgutils, lengths, tell_fields_apart
 
 RECORDS = types.Record, OpenRecord
 PLAIN = types.Number, types.Boolean, *RECORDS, types.NoneType, types.Function, types.Module, types.Dispatcher
@@ -325,7 +324,7 @@ class Direct(Lower):
 
     def _product(self, lengths: list[Any]) -> Any:
         """The number of entries of some axes: a constant if they are."""
-        if all(isinstance(one, Constant) for one in lengths):
+        if all(hasattr(one, "constant") for one in lengths):
             return self._whole(math.prod(one.constant for one in lengths))
         return reduce(self.builder.mul, [one for one in lengths if not _is(one, 1)])
 

@@ -30,6 +30,7 @@ __all__ = [
     "OpenRecord",
     "array_from",
     "beginning",
+    "cgutils",
     "entry_of",
     "ir",
     "lengths",
