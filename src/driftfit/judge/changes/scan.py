@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.kernel import Array, Driver, part, shared
 from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
@@ -196,14 +196,14 @@ def before(problem: Problem, t: int, work: Work, S: Array) -> None:
     add(work.Z, problem.edges[m], t, S)
 
 
-@shared
-def cost(first: Array, last: Array, G: Array, least: float) -> float:
-    """What constants leave between two places with these sums before them; their factor is left in G. Information up to
-    ``least`` is none."""
-    for i in range(G.shape[0]):
+@part(sizes=(2, 3, 4))
+def cost(n: int, first: Array, last: Array, G: Array, least: float) -> float:
+    """What n constants leave between two places with these sums before them; their factor is left in G. Information up
+    to ``least`` is none."""
+    for i in range(n + 1):
         for j in range(i + 1):
             G[i, j] = last[i, j] - first[i, j]
-    return eliminate(G, G.shape[0] - 1, least)  # type: ignore[no-any-return]
+    return eliminate(G, n, least)  # type: ignore[no-any-return]
 
 
 @shared
@@ -237,7 +237,7 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
     for j in range(1, m):
         for i in range(j):
             used = (most > 1 or i == 0 or j == m - 1) and edges[j] - edges[i] >= problem.sizes[0]
-            work.cost[i, j] = cost(work.C[i], work.C[j], work.G, least) if used else np.inf
+            work.cost[i, j] = cost(X.shape[1], work.C[i], work.C[j], work.G, least) if used else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
         for j in range(1, m):
@@ -255,7 +255,7 @@ def segment(problem: Problem, k: int, count: int, work: Work, least: float) -> f
     """What constants leave of segment k of those between ``at``; their factor is left in G."""
     before(problem, work.at[k - 1] if k > 0 else 0, work, work.low)
     before(problem, work.at[k] if k < count else work.Z.shape[0], work, work.high)
-    left: float = cost(work.low, work.high, work.G, least)
+    left: float = cost(work.Z.shape[1] - 1, work.low, work.high, work.G, least)
     return left
 
 
@@ -264,7 +264,7 @@ def place(problem: Problem, count: int, work: Work, least: float) -> float:
     """The rows ``at`` that begin segments of so many breaks, moved within cells; returns the sum of squares, inf
     without room."""
     fewest, edges, at, low, here, high = problem.sizes[0], problem.edges, work.at, work.low, work.here, work.high
-    m, N, total = work.cost.shape[0] - 1, work.Z.shape[0], 0.0
+    m, N, n, total = work.cost.shape[0] - 1, work.Z.shape[0], work.Z.shape[1] - 1, 0.0
     if not work.best[count, m] < np.inf:
         return np.inf
     for k in range(count, 0, -1):
@@ -282,7 +282,7 @@ def place(problem: Problem, count: int, work: Work, least: float) -> float:
             last = min(at[k] + reach, end - fewest)
             before(problem, t, work, here)
             while t <= last:
-                value = cost(low, here, work.G, least) + cost(here, high, work.G, least)
+                value = cost(n, low, here, work.G, least) + cost(n, here, high, work.G, least)
                 if value < most:
                     most = value
                     at[k] = t

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.smooth.solvers.rank import column_sizes
 
 CLIP = 1.5
@@ -61,7 +61,7 @@ class Fit(NamedTuple):
     """Noise standard deviation, from the median of the absolute residuals."""
 
 
-@shared
+@part
 def eliminate(M: Array, n: int, least: float) -> float:
     """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal, D^-1 on
     it; returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
