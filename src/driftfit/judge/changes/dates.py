@@ -49,12 +49,12 @@ def _at_each(
     first = lags[p - 1] if p > 0 else 0
     total, left, passed = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
     G, row, done = np.zeros((k + 1, k + 1)), np.zeros(k + 1), 0
-    add(Z, 0, Z.shape[0], total)
-    add(Z, 0, first, passed)
+    add(n + 1, Z, 0, Z.shape[0], total)
+    add(n + 1, Z, 0, first, passed)
     for d in range(place.shape[0]):
         at = place[d] - start
-        add(Z, done, at, left)
-        add(Z, done + first, at + first, passed)
+        add(n + 1, Z, done, at, left)
+        add(n + 1, Z, done + first, at + first, passed)
         done = at
         for i in range(n + 1):
             for j in range(i + 1):
