@@ -79,7 +79,7 @@ def loudest(z: Array, ranked: Array) -> int | None:
     """The regressor, of those with `ranks` (N, n), with which residuals z (N,) grow most clearly; None if with none."""
     square = clipped(z) ** 2
     d = (square - square.mean())[:, None] * ranked
-    total = len(z) * newey_west(d, 0.0)
+    total = len(z) * newey_west(d)
     varied = ranked.any(axis=0) & (total > 0.0)
     p = np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)
     most = int(np.argmin(p))
