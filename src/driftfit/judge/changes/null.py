@@ -56,8 +56,8 @@ class Lags(NamedTuple):
     @property
     def delays(self) -> Array:
         """(k,): by how many rows each is earlier."""
-        last = [np.flatnonzero(source >= 0)[-1] for source in self.source.T]
-        return np.array(last, np.int64) - self.source[last, np.arange(len(last))]
+        last = len(self.source) - 1 - np.argmax(self.source[::-1] >= 0, axis=0)
+        return np.asarray(last - self.source[last, np.arange(len(last))])
 
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
@@ -203,15 +203,13 @@ class Draws:
         return max(radius(own, np.sort(lags)), radius(ar, self.problem.lags))
 
 
-def p_of(x: float, drawn: Array) -> float:
-    """p-value of x among draws (R,): its rank, beyond the largest ones by an exponential tail."""
-    R = len(drawn)
-    ordered = np.sort(drawn)
-    if x <= ordered[-6]:
-        return float((1 + np.sum(drawn >= x)) / (R + 1))
+def p_of(x: Array, drawn: Array) -> Array:
+    """p-values (k,) of x (k,) among draws (R, k): ranks, beyond the largest draws by an exponential tail."""
+    R, ordered = len(drawn), np.sort(drawn, axis=0)
     top = ordered[-max(10, R // 10) :]
-    mean = float(np.mean(top[1:] - top[0])) if len(top) > 1 else 0.0
-    return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
+    mean = np.maximum((top - top[0]).sum(axis=0) / (len(top) - 1), SMALL)
+    tail = len(top) / (R + 1) * np.exp(-np.maximum(x - top[0], 0.0) / mean)
+    return np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail)
 
 
 def price(drawn: Array, level: float) -> tuple[float, float]:
@@ -227,7 +225,7 @@ def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
     R = len(drawn)
     ranks = np.argsort(np.argsort(-drawn, axis=0), axis=0) + 1
     least = (ranks / (R + 1.0)).min(axis=1)
-    each = np.array([p_of(float(one), column) for one, column in zip(x, drawn.T, strict=True)])
+    each = p_of(x, drawn)
     p = float(each.min())
     few = 6.0 / (R + 1)
     if p >= few:
@@ -263,10 +261,11 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
         if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
-    p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
     dates = tuple(found.at[k, :k] for k in range(most + 1))
     constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, draws.root(theta, ar)), draws
+    return Tested(
+        p, each, found.L, p_of(found.L[1:], L[:, 1:]), R, found.rss, dates, found.ar, constants, draws.root(theta, ar)
+    ), draws
 
 
 def gains(rss: Array, N: int) -> Array:

@@ -52,8 +52,8 @@ class Problem(NamedTuple):
 
 def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
     """The problem of a record with up to ``most`` breaks."""
-    N = len(g)
-    edges = np.linspace(0, N, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
+    cells = min(max(len(g) // 8, 4), CELLS)
+    edges = len(g) * np.arange(cells + 1) // cells
     return Problem(g, lags, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
 
 
