@@ -393,7 +393,7 @@ def judged(known: Evidence) -> Verdict:
         level=level,
         parameters=tuple(own.get(name, unjudged(name)) for name in run.model.names),
         events=happened,
-        weights={} if found is None else found.kind.weights,
+        weights=found.kind.weights if found is not None and found.rejected else {},
         rms=root_mean_square(error),
         rivals=rivals,
         samples=len(at),
