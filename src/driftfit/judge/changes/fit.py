@@ -297,10 +297,11 @@ def together(
             theta, _ = estimated(X, y, (lags, ar, g), breaks)
             lags = lags_of(noise_of(X, y, theta, breaks) * g, orders) if order is None else lags
     assert best is not None
+    Z, z = X * g[:, None], y * g
     for knots in KNOTS:
         if n * knots > N // 8 or order is not None:
             break
-        path, r = on_lines(X * g[:, None], y * g, N, knots)
+        path, r = on_lines(Z, z, N, knots)
         v = y - np.einsum("tj,tj->t", X, path)
         lags = lags_of(v * g, orders)
         ar = regressed(v, g, lags)

@@ -205,7 +205,7 @@ def p_of(x: Array, drawn: Array) -> Array:
     top = ordered[-max(10, R // 10) :]
     mean = np.maximum((top - top[0]).sum(axis=0) / (len(top) - 1), SMALL)
     tail = len(top) / (R + 1) * np.exp(-np.maximum(x - top[0], 0.0) / mean)
-    return np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail)
+    return np.asarray(np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail))
 
 
 def price(drawn: Array, level: float) -> tuple[float, float]:

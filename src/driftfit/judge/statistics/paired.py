@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array, Driver, shared
 
 LEAST = 10
 """Smallest number of errors that are compared."""
@@ -30,17 +30,22 @@ class Paired(NamedTuple):
     p: float
 
 
-@Driver
-def newey_west(d: Array) -> Array:
-    """Long-run variance (k,) of d (N, k) about 0."""
-    (N, k), v = d.shape, np.zeros(d.shape[1])
+@shared
+def long_run(d: Array) -> float:
+    """Long-run variance of d (N,) about 0."""
+    N, v = d.shape[0], 0.0
     lags = min(int(4.0 * (N / 100.0) ** (2.0 / 9.0)), N - 1)
     for lag in range(lags + 1):
         share = (2.0 if lag > 0 else 1.0) * (1.0 - lag / (lags + 1.0)) / N
         for t in range(lag, N):
-            for i in range(k):
-                v[i] += share * d[t, i] * d[t - lag, i]
+            v += share * d[t] * d[t - lag]
     return v
+
+
+@Driver
+def newey_west(d: Array) -> float:
+    """Long-run variance of d (N,) about its mean."""
+    return long_run(d - np.mean(d))  # type: ignore[no-any-return]
 
 
 def paired(name: str, rival: Array, own: Array) -> Paired:
@@ -50,8 +55,7 @@ def paired(name: str, rival: Array, own: Array) -> Paired:
         return Paired(name, rms, float("nan"), float("nan"))
     unit = max(np.abs(rival).max(), np.abs(own).max()) or 1.0  # squares of squares would leave the range of numbers
     d = (rival / unit) ** 2 - (own / unit) ** 2
-    mean = float(d.mean())
-    v = float(newey_west((d - mean)[:, None])[0])
+    mean, v = float(d.mean()), float(newey_west(d))
     # where every sample has the same difference, v is 0
     t = mean / math.sqrt(v / len(d)) if v > 0.0 else math.copysign(math.inf, mean) if mean else 0.0
     return Paired(name, rms, t, 0.5 * math.erfc(t / math.sqrt(2.0)))

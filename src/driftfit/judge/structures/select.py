@@ -356,7 +356,7 @@ def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictio
     for structure, prediction, total in zip(structures, predictions, totals, strict=True):
         lost = predictions[top].loglik - prediction.loglik
         parts = [lost[span][judged[span]] for span in pool.spans]  # records are independent: their variances add up
-        variance = sum(len(d) * max(float(newey_west((d - d.mean())[:, None])[0]), 0.0) for d in parts if len(d) > 1)
+        variance = sum(len(part) * max(float(newey_west(part)), 0.0) for part in parts if len(part) > 1)
         spread = float(np.sqrt(variance)) if count > 10 else float("nan")
         error = (y - prediction.y_hat)[judged]
         rms = float(np.sqrt(np.mean(error * error))) if count else float("nan")
