@@ -13,6 +13,7 @@ sample that the run left out, and none is scored on it.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -75,6 +76,11 @@ class Errors(NamedTuple):
     scored: Array
 
 
+@lru_cache(16)
+def _constant_arx(inputs: int) -> ARX:
+    return ARX(2, 1 if inputs else 0, inputs=inputs, intercept=True)
+
+
 def errors(run: Track, record: Record, burn: int | None = None, steady: Array | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
@@ -88,8 +94,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
     gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
     known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
-    small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
-    arx = constant_least_squares(small, Record(y, u, known))
+    arx = constant_least_squares(_constant_arx(u.shape[1]), Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     lagged = _with_lags(run.model, steady, y, constant, record.known.noise)
     lagged = np.where(np.isfinite(lagged), lagged, constant)

@@ -12,6 +12,7 @@ sent, and a process may be killed for its memory. An error is then raised here, 
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import signal
@@ -138,6 +139,7 @@ class Processes:
 
 def serve() -> None:
     """Judge batches until the input ends; the answer to one that raises an exception is None."""
+    gc.freeze()  # what was imported stays: no collection looks at it again
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the process that sends the batches
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a model prints does not mix with the answers

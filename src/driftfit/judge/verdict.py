@@ -380,7 +380,8 @@ def judged(known: Evidence) -> Verdict:
     happened = () if found is None or not found.rejected else events(found, names, at, run.time_text)
     own = {name: _moved(found, happened, name, i) for i, name in enumerate(names)} if found is not None else {}
     scored = known.errors.scored
-    error, *others = (rounded(each[scored], run.y[scored]) for each in known.errors[:-1])
+    y = run.y[scored]
+    error, *others = (rounded(each[scored], y) for each in known.errors[:-1])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
     loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.noise.ranks)
@@ -392,7 +393,7 @@ def judged(known: Evidence) -> Verdict:
         level=level,
         parameters=tuple(own.get(name, unjudged(name)) for name in run.model.names),
         events=happened,
-        weights={} if found is None else found.kind.weights,
+        weights=found.kind.weights if found is not None and found.rejected else {},
         rms=root_mean_square(error),
         rivals=rivals,
         samples=len(at),

@@ -7,7 +7,8 @@ segments together), `null` (the test), `dates`, `which` and `kinds`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -19,17 +20,58 @@ from driftfit.judge.changes.null import Model, Tested, tested
 from driftfit.judge.changes.which import Which, which
 
 
-class Changes(NamedTuple):
-    """What a record of N rows says about n parameters."""
+@dataclass(frozen=True)
+class Changes:
+    """What a record of N rows says about n parameters. What is found beyond the test is computed when it is needed."""
 
     model: Model
     test: Tested
     level: float
-    found: Dated
-    which: Which
-    kind: Kind
-    moving: tuple[int, ...]
-    """Parameters that change."""
+    dates: float
+    """Level of the intervals of dates."""
+    start: tuple[Array, Array, tuple[float, float]]
+    """What `driftfit.judge.changes.dates.counted` found; no break where constants are not rejected."""
+
+    @cached_property
+    def _all(self) -> tuple[Dated, Which, Kind, tuple[int, ...]]:
+        model, test, (breaks, ar, prices) = self.model, self.test, self.start
+        N, n = model.phi.shape
+        found = dated(model, breaks, ar, prices, self.dates)
+        none = Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
+        changed = which(model, found) if len(breaks) else none
+        if (changed.dates != found.breaks).any():
+            found = dated(model, changed.dates, ar, prices, self.dates, final=True)
+        moving = tuple(sorted({j for own in changed.at for j in own}))
+        if self.rejected and not moving:
+            moving = (int(np.argmin(test.p_path[n:])),)
+        own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
+        moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
+        return (
+            found._replace(theta=found.theta + moved),
+            changed._replace(theta=changed.theta + moved),
+            own._replace(path=own.path + model.offset) if own.path.size else own,
+            moving,
+        )
+
+    @property
+    def found(self) -> Dated:
+        """The segments."""
+        return self._all[0]
+
+    @property
+    def which(self) -> Which:
+        """The parameters that change at each date."""
+        return self._all[1]
+
+    @property
+    def kind(self) -> Kind:
+        """The kind of change."""
+        return self._all[2]
+
+    @property
+    def moving(self) -> tuple[int, ...]:
+        """Parameters that change."""
+        return self._all[3]
 
     @property
     def rejected(self) -> bool:
@@ -40,7 +82,7 @@ class Changes(NamedTuple):
     def scores(self) -> Array:
         """(N, n): sums of the scores of constants over the root of their sum of squares."""
         lags, g = self.model.noise.lags, self.model.noise.g
-        Z, z = white_rows(self.model.phi, self.model.y, lags, self.test.ar[0], g)
+        Z, z = white_rows(self.model.phi, self.model.y, lags, self.test.ar, g)
         own = Z * (z - Z @ (self.test.theta - self.model.offset))[:, None]
         size = np.sqrt(np.sum(own**2, axis=0))
         return np.vstack([np.zeros((order_of(lags), Z.shape[1])), np.cumsum(own, axis=0) / np.where(size > 0, size, 1)])
@@ -54,26 +96,6 @@ class Changes(NamedTuple):
 def changes(model: Model, level: float, dates: float = LEVEL) -> Changes:
     """Judge a regression: at which dates its coefficients changed, by a test with the error rate ``level``, with
     intervals of the level ``dates``."""
-    N, n = model.phi.shape
     test, draws = tested(model)
-    breaks, ar, prices = NONE, test.ar[0], (np.nan, np.nan)
-    if test.p < level:
-        breaks, ar, prices = counted(model, test, draws, level)
-    found = dated(model, breaks, ar, prices, dates)
-    changed = which(model, found) if len(breaks) else Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
-    if (changed.dates != found.breaks).any():
-        found = dated(model, changed.dates, ar, prices, dates, final=True)
-    moving = tuple(sorted({j for own in changed.at for j in own}))
-    if test.p < level and not moving:
-        moving = (int(np.argmin(test.p_path[n:])),)
-    own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
-    moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
-    return Changes(
-        model,
-        test._replace(theta=test.theta + model.offset),
-        level,
-        found._replace(theta=found.theta + moved),
-        changed._replace(theta=changed.theta + moved),
-        own._replace(path=own.path + model.offset) if own.path.size else own,
-        moving,
-    )
+    start = counted(model, test, draws, level) if test.p < level else (NONE, test.ar, (np.nan, np.nan))
+    return Changes(model, test._replace(theta=test.theta + model.offset), level, dates, start)

@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.changes.fit import estimated, noise_of, order_of, regressed, split, white_rows
+from driftfit.judge.changes.fit import MOST, estimated, noise_of, order_of, regressed, split, white_rows
 from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price
-from driftfit.judge.changes.scan import SINGULAR, add
+from driftfit.judge.changes.scan import SINGULAR, add, searched
 from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
 
 LEVEL = 0.95
@@ -49,12 +49,12 @@ def _at_each(
     first = lags[p - 1] if p > 0 else 0
     total, left, passed = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
     G, row, done = np.zeros((k + 1, k + 1)), np.zeros(k + 1), 0
-    add(Z, 0, Z.shape[0], total)
-    add(Z, 0, first, passed)
+    add(n + 1, Z, 0, Z.shape[0], total)
+    add(n + 1, Z, 0, first, passed)
     for d in range(place.shape[0]):
         at = place[d] - start
-        add(Z, done, at, left)
-        add(Z, done + first, at + first, passed)
+        add(n + 1, Z, done, at, left)
+        add(n + 1, Z, done + first, at + first, passed)
         done = at
         for i in range(n + 1):
             for j in range(i + 1):
@@ -143,8 +143,10 @@ def stepwise(gain: Array, prices: tuple[float, float]) -> int:
 def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Array, Array, tuple[float, float]]:
     """(breaks, autoregression, prices), given that constants are rejected."""
     noise, N = model.noise, len(model.y)
-    room = int(np.isfinite(test.rss).sum())
-    gain = N * np.log(test.rss[0] / test.rss[:room])
+    most = max(2, min(MOST, N // noise.fewest - 1))
+    found, _ = searched(model.X, model.y, draws.problem._replace(sizes=np.array([noise.fewest, most])))
+    room = int(np.isfinite(found.rss).sum())
+    gain = N * np.log(found.rss[0] / found.rss[:room])
     first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
 
     def number(drawn: Array, constants: tuple[Array, Array], most: int) -> tuple[int, tuple[float, float]]:
@@ -161,12 +163,12 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     dynamic = len(noise.lags) or len(model.lags.columns)
     K, prices = number(test.gains, draws.constants, 0 if dynamic else DRAWS[-1])
     if K and dynamic:  # changes made the dynamics of constants too slow
-        breaks, ar = test.breaks[K], test.ar[K]
+        breaks, ar = found.at[K, :K], found.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if draws.root(mean, ar) < 1.0:
             K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
-    return test.breaks[K], test.ar[K], prices
+    return found.at[K, :K], found.ar[K], prices
 
 
 def shortest_interval(weight: Array, level: float) -> tuple[int, int]:

@@ -21,7 +21,7 @@ import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.scan import SINGULAR, problem_of, searched
-from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible
+from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible, scale_of
 from driftfit.judge.statistics.whiteness import loudest, ranks
 
 NONE = np.zeros(0, np.int64)
@@ -181,23 +181,28 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
     return np.append(lags, found[1]) if found[1] else lags
 
 
+@Driver
+def _levels(e: Array, first: int, edges: Array) -> Array:
+    """log (m,): the level of e (N,) in windows between edges (m + 1,), of residuals limited at three medians."""
+    least, own = max(scale_of(e[first:]), 1e-3 * np.std(e[first:]), SMALL), np.empty(len(edges) - 1)
+    for k in range(len(own)):
+        sizes = np.sort(np.abs(e[edges[k] : edges[k + 1]]))
+        count = len(sizes)
+        middle = 0.5 * (sizes[(count - 1) // 2] + sizes[count // 2])
+        square = np.minimum(sizes, HELD * max(MEDIAN * middle, 0.05 * least)) ** 2
+        own[k] = np.log(max(np.sqrt(np.sum(square) / count), 0.05 * least))
+    return own
+
+
 def level_of(e: Array, first: int) -> Array:
     """c (N,): the slowly changing level of white residuals e, constant where windows differ by no more than chance."""
-    N, used = len(e), e[first:]
-    s = max(deviation(used), 1e-3 * float(np.std(used)), SMALL)
+    N = len(e)
     m = max(3, min(WINDOWS, N // 20))
-    edges = np.linspace(first, N, m + 1).astype(int)
-    count = np.diff(edges)
-    parts = np.full((m, count.max()), np.inf)
-    parts[np.arange(count.max()) < count[:, None]] = np.abs(used)
-    parts.sort(axis=1)
-    middle = 0.5 * (parts[np.arange(m), (count - 1) // 2] + parts[np.arange(m), count // 2])
-    limit = HELD * np.maximum(MEDIAN * middle, 0.05 * s)[:, None]
-    square = np.sum(np.where(np.isfinite(parts), np.minimum(parts, limit), 0.0) ** 2, axis=1) / count
-    own = np.log(np.maximum(np.sqrt(square), 0.05 * s))
+    edges = first + (N - first) * np.arange(m + 1) // m
+    own = _levels(e, first, edges)
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
-    middle = float(np.median(own))
+    middle = float(np.sort(own)[(m - 1) // 2 : m // 2 + 1].mean())
     return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
 
 

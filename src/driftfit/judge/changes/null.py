@@ -22,14 +22,14 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.changes.fit import HELD, MOST, Noise, coefficients, noise, order_of, white_rows
+from driftfit.judge.changes.fit import HELD, Noise, coefficients, noise, order_of, white_rows
 from driftfit.judge.changes.recursion import Recursion, Results, draw
 from driftfit.judge.changes.scan import Found, Problem, Work, problem_of, searched
 from driftfit.judge.statistics.robust import SMALL, Basis, Fit, invertible
 
 DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
-CLEAR = 10.0
+CLEAR = 5.0
 """Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
 SURE = 1e-4
 """p below which the last draws would change no decision; results print no smaller one."""
@@ -56,8 +56,8 @@ class Lags(NamedTuple):
     @property
     def delays(self) -> Array:
         """(k,): by how many rows each is earlier."""
-        last = [np.flatnonzero(source >= 0)[-1] for source in self.source.T]
-        return np.array(last, np.int64) - self.source[last, np.arange(len(last))]
+        last = len(self.source) - 1 - np.argmax(self.source[::-1] >= 0, axis=0)
+        return np.asarray(last - self.source[last, np.arange(len(last))])
 
     def only(self, rows: Array, columns: Sequence[int]) -> Lags:
         """Those of some rows and columns, given by their indices."""
@@ -81,12 +81,8 @@ class Tested(NamedTuple):
     """(2 n,): p-values of the last two."""
     gains: Array
     """(R, 2): gains of one and of two breaks of the draws."""
-    rss: Array
-    """(K + 1,): sums of squares with 0 .. K breaks; inf where there is no room."""
-    breaks: tuple[Array, ...]
-    """Their dates."""
     ar: Array
-    """(K + 1, p): their autoregressions."""
+    """(p,): the autoregression of constants."""
     theta: Array
     """(n,): constants, in units of the model."""
     root: float
@@ -166,7 +162,7 @@ class Draws:
         way = Recursion(
             model.phi, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
-        signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
+        signs = self.rng.integers(0, 2, (count, len(model.y)), bool) * 2.0 - 1.0
         results = Results(
             np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
             np.zeros((count, len(ar))),
@@ -203,15 +199,13 @@ class Draws:
         return max(radius(own, np.sort(lags)), radius(ar, self.problem.lags))
 
 
-def p_of(x: float, drawn: Array) -> float:
-    """p-value of x among draws (R,): its rank, beyond the largest ones by an exponential tail."""
-    R = len(drawn)
-    ordered = np.sort(drawn)
-    if x <= ordered[-6]:
-        return float((1 + np.sum(drawn >= x)) / (R + 1))
+def p_of(x: Array, drawn: Array) -> Array:
+    """p-values (k,) of x (k,) among draws (R, k): ranks, beyond the largest draws by an exponential tail."""
+    R, ordered = len(drawn), np.sort(drawn, axis=0)
     top = ordered[-max(10, R // 10) :]
-    mean = float(np.mean(top[1:] - top[0])) if len(top) > 1 else 0.0
-    return float(len(top) / (R + 1) * np.exp(-(x - top[0]) / max(mean, SMALL)))
+    mean = np.maximum((top - top[0]).sum(axis=0) / (len(top) - 1), SMALL)
+    tail = len(top) / (R + 1) * np.exp(-np.maximum(x - top[0], 0.0) / mean)
+    return np.asarray(np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail))
 
 
 def price(drawn: Array, level: float) -> tuple[float, float]:
@@ -227,7 +221,7 @@ def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
     R = len(drawn)
     ranks = np.argsort(np.argsort(-drawn, axis=0), axis=0) + 1
     least = (ranks / (R + 1.0)).min(axis=1)
-    each = np.array([p_of(float(one), column) for one, column in zip(x, drawn.T, strict=True)])
+    each = p_of(x, drawn)
     p = float(each.min())
     few = 6.0 / (R + 1)
     if p >= few:
@@ -243,18 +237,16 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
     size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
     paths /= np.maximum(size, SMALL)[:, None]
-    most = max(2, min(MOST, N // noise.fewest - 1))
-    problem = problem_of(noise.g, noise.lags, noise.fewest, most, paths, model.floor)
+    problem = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     found, _ = searched(model.X, model.y, problem)
-    few = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
     held = noise.e.copy()
     Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
     held[first:] /= np.maximum(1.0 - np.sum(Z.T * np.linalg.solve(invertible(Z.T @ Z), Z.T), axis=0), 0.1)
     if first or len(model.lags.columns):  # an outlier of the output would be one of the dynamics
         held = np.clip(held, -HELD * noise.level, HELD * noise.level)
-    draws = Draws(model, few, held)
+    draws = Draws(model, problem, held)
     theta, ar = draws.constants = draws.unbiased(model.basis @ found.theta, found.ar[0])
-    x = np.append(found.L[0], gains(found.rss[None, :3], N)[0])
+    x = np.append(found.L[0], gains(found.rss[None], N)[0])
     R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
     for count in np.diff(DRAWS, prepend=0):
         drawn = draws.of(theta, ar, int(count), True)
@@ -263,10 +255,8 @@ def tested(model: Model) -> tuple[Tested, Draws]:
         p, each = smallest(x, np.column_stack([L[:, 0], R]))
         if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
-    p_path = np.array([p_of(float(one), drawn) for one, drawn in zip(found.L[1:], L.T[1:], strict=True)])
-    dates = tuple(found.at[k, :k] for k in range(most + 1))
-    constants = model.basis @ found.theta
-    return Tested(p, each, found.L, p_path, R, found.rss, dates, found.ar, constants, draws.root(theta, ar)), draws
+    own, root = model.basis @ found.theta, draws.root(theta, ar)
+    return Tested(p, each, found.L, p_of(found.L[1:], L[:, 1:]), R, found.ar[0], own, root), draws
 
 
 def gains(rss: Array, N: int) -> Array:

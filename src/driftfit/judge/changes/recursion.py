@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.kernel import Array, Driver, part, shared
 from driftfit.judge.changes.scan import Found, Problem, Work, search, settle
 
 
@@ -52,6 +52,16 @@ def simulate(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y:
             y[t] += phi[t, j] * way.theta[j]
 
 
+@part(sizes=(2, 3, 4))
+def turned(n: int, phi: Array, basis: Array, X: Array) -> None:
+    """X (N, n) = phi basis."""
+    for t in range(phi.shape[0]):
+        for j in range(n):
+            X[t, j] = 0.0
+            for i in range(n):
+                X[t, j] += phi[t, i] * basis[i, j]
+
+
 class Results(NamedTuple):
     """What is found in R draws; sums of squares, Nyblom's statistics, or constants and their autoregressions."""
 
@@ -72,12 +82,9 @@ def _draw(
     N, n = way.phi.shape
     for d in range(signs.shape[0]):
         simulate(way, problem.lags, signs[d], work.v, work.phi, work.y)
+        turned(n, work.phi, way.basis, work.X)
         for t in range(N):
             work.y[t] = work.v[t]  # without what constants explain, which may be far larger
-            for j in range(n):
-                work.X[t, j] = 0.0
-                for i in range(n):
-                    work.X[t, j] += work.phi[t, i] * way.basis[i, j]
         if whole > 0:
             search(work.X, work.y, problem, work, found)
             for count in range(3):

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.engine.kernel import Array, Driver, part, shared
 from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
@@ -52,8 +52,8 @@ class Problem(NamedTuple):
 
 def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
     """The problem of a record with up to ``most`` breaks."""
-    N = len(g)
-    edges = np.linspace(0, N, int(np.clip(N // 8, 4, CELLS)) + 1).astype(np.int64)
+    cells = min(max(len(g) // 8, 4), CELLS)
+    edges = len(g) * np.arange(cells + 1) // cells
     return Problem(g, lags, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
 
 
@@ -115,20 +115,15 @@ class Found(NamedTuple):
         return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), L)
 
 
-@shared
-def whiten(X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> None:
+@part(sizes=(2, 3, 4))
+def whiten(n: int, X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> None:
     """Z (N, n + 1): rows and outputs after whitening, times g; the rows before the last lag are 0."""
-    N, n, p = X.shape[0], X.shape[1], lags.shape[0]
+    N, p = X.shape[0], lags.shape[0]
     first = lags[p - 1] if p > 0 else 0
     for t in range(N):
-        if t < first:
-            for j in range(n + 1):
-                Z[t, j] = 0.0
-            continue
-        for j in range(n):
-            Z[t, j] = X[t, j]
-        Z[t, n] = y[t]
-        for i in range(p):
+        for j in range(n + 1):
+            Z[t, j] = 0.0 if t < first else X[t, j] if j < n else y[t]
+        for i in range(p if t >= first else 0):
             before = t - lags[i]
             for j in range(n):
                 Z[t, j] -= a[i] * X[before, j]
@@ -165,15 +160,15 @@ def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
             work.v[t] -= X[t, j] * work.theta[j]
 
 
-@shared
-def add(Z: Array, first: int, last: int, S: Array) -> None:
-    """Add the products of rows first .. last - 1 of Z to S, a lower triangle; two at a time take less."""
+@part(sizes=(3, 4, 5))
+def add(k: int, Z: Array, first: int, last: int, S: Array) -> None:
+    """Add the products of rows first .. last - 1 of Z (N, k) to S, a lower triangle; two at a time take less."""
     if (last - first) % 2 == 1:
-        for i in range(Z.shape[1]):
+        for i in range(k):
             for j in range(i + 1):
                 S[i, j] += Z[first, i] * Z[first, j]
     for t in range(first + (last - first) % 2, last, 2):
-        for i in range(Z.shape[1]):
+        for i in range(k):
             for j in range(i + 1):
                 S[i, j] += Z[t, i] * Z[t, j] + Z[t + 1, i] * Z[t + 1, j]
 
@@ -193,17 +188,17 @@ def before(problem: Problem, t: int, work: Work, S: Array) -> None:
     while m + 1 < problem.edges.shape[0] and problem.edges[m + 1] <= t:
         m += 1
     copy(work.C[m], S)
-    add(work.Z, problem.edges[m], t, S)
+    add(work.Z.shape[1], work.Z, problem.edges[m], t, S)
 
 
-@shared
-def cost(first: Array, last: Array, G: Array, least: float) -> float:
-    """What constants leave between two places with these sums before them; their factor is left in G. Information up to
-    ``least`` is none."""
-    for i in range(G.shape[0]):
+@part(sizes=(2, 3, 4))
+def cost(n: int, first: Array, last: Array, G: Array, least: float) -> float:
+    """What n constants leave between two places with these sums before them; their factor is left in G. Information up
+    to ``least`` is none."""
+    for i in range(n + 1):
         for j in range(i + 1):
             G[i, j] = last[i, j] - first[i, j]
-    return eliminate(G, G.shape[0] - 1, least)  # type: ignore[no-any-return]
+    return eliminate(G, n, least)  # type: ignore[no-any-return]
 
 
 @shared
@@ -211,9 +206,9 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
     """Constants and their autoregression in turn; returns the sum of squares."""
     rss, N = 0.0, X.shape[0]
     for round in range(ROUNDS):
-        whiten(X, y, problem.g, problem.lags, a, work.Z)
+        whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
         copy(work.C[0], work.G)
-        add(work.Z, 0, N, work.G)
+        add(work.Z.shape[1], work.Z, 0, N, work.G)
         rss = eliminate(work.G, X.shape[1], 0.0)
         solved(work.G, work.theta)
         if a.shape[0] == 0:
@@ -227,17 +222,17 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
 @shared
 def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Work) -> float:
     """The best partitions on cells with up to ``most`` breaks, in noise a; returns the information that is none."""
-    whiten(X, y, problem.g, problem.lags, a, work.Z)
+    whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
     edges, m, least = problem.edges, work.cost.shape[0], 0.0
     for j in range(1, m):
         copy(work.C[j - 1], work.C[j])
-        add(work.Z, edges[j - 1], edges[j], work.C[j])
+        add(work.Z.shape[1], work.Z, edges[j - 1], edges[j], work.C[j])
     for i in range(X.shape[1]):
         least = max(least, SINGULAR * work.C[m - 1, i, i])
     for j in range(1, m):
         for i in range(j):
             used = (most > 1 or i == 0 or j == m - 1) and edges[j] - edges[i] >= problem.sizes[0]
-            work.cost[i, j] = cost(work.C[i], work.C[j], work.G, least) if used else np.inf
+            work.cost[i, j] = cost(X.shape[1], work.C[i], work.C[j], work.G, least) if used else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
         for j in range(1, m):
@@ -255,7 +250,7 @@ def segment(problem: Problem, k: int, count: int, work: Work, least: float) -> f
     """What constants leave of segment k of those between ``at``; their factor is left in G."""
     before(problem, work.at[k - 1] if k > 0 else 0, work, work.low)
     before(problem, work.at[k] if k < count else work.Z.shape[0], work, work.high)
-    left: float = cost(work.low, work.high, work.G, least)
+    left: float = cost(work.Z.shape[1] - 1, work.low, work.high, work.G, least)
     return left
 
 
@@ -264,7 +259,7 @@ def place(problem: Problem, count: int, work: Work, least: float) -> float:
     """The rows ``at`` that begin segments of so many breaks, moved within cells; returns the sum of squares, inf
     without room."""
     fewest, edges, at, low, here, high = problem.sizes[0], problem.edges, work.at, work.low, work.here, work.high
-    m, N, total = work.cost.shape[0] - 1, work.Z.shape[0], 0.0
+    m, N, n, total = work.cost.shape[0] - 1, work.Z.shape[0], work.Z.shape[1] - 1, 0.0
     if not work.best[count, m] < np.inf:
         return np.inf
     for k in range(count, 0, -1):
@@ -282,11 +277,11 @@ def place(problem: Problem, count: int, work: Work, least: float) -> float:
             last = min(at[k] + reach, end - fewest)
             before(problem, t, work, here)
             while t <= last:
-                value = cost(low, here, work.G, least) + cost(here, high, work.G, least)
+                value = cost(n, low, here, work.G, least) + cost(n, here, high, work.G, least)
                 if value < most:
                     most = value
                     at[k] = t
-                add(work.Z, t, t + by, here)
+                add(work.Z.shape[1], work.Z, t, t + by, here)
                 t += by
             reach, by = by, 1 if by > 1 else 0
     for k in range(count + 1):
@@ -327,24 +322,30 @@ def form(w: Array, V: Array) -> float:
     return total
 
 
-@shared
-def nyblom(problem: Problem, work: Work, L: Array) -> None:
-    """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
-    N, n, V, M, S, score = work.Z.shape[0], work.theta.shape[0], work.G, work.low, work.sums, work.score
+@part(sizes=(2, 3, 4))
+def sums(n: int, Z: Array, theta: Array, S: Array, score: Array, V: Array, M: Array) -> None:
+    """V, M (n, n), lower triangles: moments of the scores of constants theta (n,), and of the sums S (n,) of these."""
     for i in range(n):
         S[i] = 0.0
         for j in range(i + 1):
             V[i, j] = M[i, j] = 0.0
-    for t in range(N):
-        r = work.Z[t, n]
+    for t in range(Z.shape[0]):
+        r = Z[t, n]
         for j in range(n):
-            r -= work.Z[t, j] * work.theta[j]
+            r -= Z[t, j] * theta[j]
         for i in range(n):
-            score[i] = work.Z[t, i] * r
+            score[i] = Z[t, i] * r
             S[i] += score[i]
             for j in range(i + 1):
                 V[i, j] += score[i] * score[j]
                 M[i, j] += S[i] * S[j]
+
+
+@shared
+def nyblom(problem: Problem, work: Work, L: Array) -> None:
+    """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
+    N, n, V, M, score = work.Z.shape[0], work.theta.shape[0], work.G, work.low, work.score
+    sums(n, work.Z, work.theta, work.sums, score, V, M)
     for k in range(1, L.shape[0]):
         L[k] = form(problem.paths[k - 1], M) / (N * max(form(problem.paths[k - 1], V), SMALL))
     for i in range(n):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver, shared
 
 LEAST = 10
 """Smallest number of errors that are compared."""
@@ -30,15 +30,22 @@ class Paired(NamedTuple):
     p: float
 
 
-def newey_west(d: Array, about: Array | float | None = None) -> Array:
-    """Long-run variance of d (N, ..) about its mean, or about a value that is known."""
-    N = len(d)
-    d = d - (d.mean(axis=0) if about is None else about)
+@shared
+def long_run(d: Array) -> float:
+    """Long-run variance of d (N,) about 0."""
+    N, v = d.shape[0], 0.0
     lags = min(int(4.0 * (N / 100.0) ** (2.0 / 9.0)), N - 1)
-    v = np.sum(d * d, axis=0)
-    for k in range(1, lags + 1):
-        v += 2.0 * (1.0 - k / (lags + 1.0)) * np.sum(d[k:] * d[:-k], axis=0)
-    return np.asarray(v / N)
+    for lag in range(lags + 1):
+        share = (2.0 if lag > 0 else 1.0) * (1.0 - lag / (lags + 1.0)) / N
+        for t in range(lag, N):
+            v += share * d[t] * d[t - lag]
+    return v
+
+
+@Driver
+def newey_west(d: Array) -> float:
+    """Long-run variance of d (N,) about its mean."""
+    return long_run(d - np.mean(d))  # type: ignore[no-any-return]
 
 
 def paired(name: str, rival: Array, own: Array) -> Paired:

@@ -10,12 +10,13 @@ Cost: O(N n^2) per iteration, usually ten.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.drivers import ROUNDING
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver, part, shared
 from driftfit.smooth.solvers.rank import column_sizes
 
 CLIP = 1.5
@@ -28,26 +29,28 @@ SHRINKING = 0.9
 """A scale that in the last round is below this share of the one before vanishes."""
 INSIDE = 0.9733
 """Mean square of a Gaussian within three standard deviations."""
-
-
-def deviation(x: Array) -> float:
-    """Standard deviation of Gaussian values x (N,) around 0, from the median of their sizes, or `LEAST` of it."""
-    sizes = np.partition(np.abs(x), (len(x) // 2, 9 * len(x) // 10))
-    half, high = sizes[len(x) // 2], sizes[9 * len(x) // 10]
-    half = half if len(x) % 2 else 0.5 * (half + sizes[: len(x) // 2].max())
-    return float(max(1.4826 * half, LEAST * high))
-
-
 LEAST = 0.5 / 1.6449
 """Smallest scale as a share of the size that nine of ten residuals do not reach, 1.6449 for a Gaussian of variance 1:
 where more than half of the readings of a coarse meter are the same, the median of the sizes is no scale.
 """
-
-
 SOLE = 1e-12
 """A leverage of 1 less this is 1."""
 FLAT = 1e-10
 """A pivot below this share of its diagonal entry counts as zero."""
+
+
+@partial(shared, arrays=True)
+def scale_of(x: Array) -> float:
+    """Standard deviation of Gaussian values x (N,) around 0, from the median of their sizes, or `LEAST` of it."""
+    sizes, N = np.sort(np.abs(x)), x.shape[0]
+    half = sizes[N // 2] if N % 2 == 1 else 0.5 * (sizes[N // 2] + sizes[N // 2 - 1])
+    return max(1.4826 * half, LEAST * sizes[9 * N // 10])  # type: ignore[no-any-return]
+
+
+@Driver
+def deviation(x: Array) -> float:
+    """`scale_of`"""
+    return scale_of(x)  # type: ignore[no-any-return]
 
 
 class Fit(NamedTuple):
@@ -61,7 +64,7 @@ class Fit(NamedTuple):
     """Noise standard deviation, from the median of the absolute residuals."""
 
 
-@shared
+@part
 def eliminate(M: Array, n: int, least: float) -> float:
     """Factor L D L' of the leading n columns of M (k, k), a lower triangle, in place: L D below the diagonal, D^-1 on
     it; returns the remaining last entry of M. Directions of no more information than ``least`` are left out.
@@ -118,9 +121,10 @@ class Basis(NamedTuple):
 
 def invertible(G: Array, share: Array | float = ROUNDED) -> Array:
     """Sums of products G (.., q, q), with this share of the mean of their diagonal beside their own."""
-    q = G.shape[-1]
-    mean = np.einsum("...ii->...", G)[..., None, None] / q
-    return np.asarray(G + (mean * share + SMALL) * np.eye(q))
+    G = G.copy()
+    own = np.einsum("...ii->...i", G)
+    own += own.sum(axis=-1, keepdims=True) / G.shape[-1] * share + SMALL
+    return G
 
 
 def orthonormal(phi: Array) -> Basis:
@@ -146,6 +150,39 @@ def sole(Q: Array) -> Array:
     return np.asarray(np.einsum("ti,ti->t", Q, Q) > (1.0 - SOLE) * len(Q))
 
 
+@Driver
+def _fitted(Q: Array, y: Array, theta: Array, residual: Array) -> float:
+    """Fill in theta (n,) and the residuals (N,) of y (N,) on Q (N, n); returns their scale."""
+    (N, n), scale, step, M = Q.shape, 0.0, np.empty(Q.shape[1]), np.empty((Q.shape[1] + 1, Q.shape[1] + 1))
+    level, residual[:] = ROUNDING * np.sqrt(np.mean(y * y)), y
+    for round in range(ROUNDS):
+        M[:] = 0.0
+        for t in range(N):
+            weight = 1.0 if round == 0 else CLIP * scale / max(abs(residual[t]), CLIP * scale)
+            for i in range(n + 1):
+                part = weight * (Q[t, i] if i < n else y[t])
+                for j in range(i + 1):
+                    M[i, j] += part * (Q[t, j] if j < n else y[t])
+        for i in range(n):
+            M[i, i] += ROUNDED * M[i, i] + SMALL
+        eliminate(M, n, 0.0)
+        solved(M, step)
+        moved = 0.0
+        for t in range(N):
+            residual[t], turn = y[t], 0.0
+            for i in range(n):
+                residual[t] -= Q[t, i] * step[i]
+                turn += Q[t, i] * (step[i] - theta[i])
+            moved = max(moved, abs(turn))
+        theta[:] = step
+        before, scale = scale, scale_of(residual)
+        if ((round > 0 and not scale > level) or round == ROUNDS - 1) and scale < SHRINKING * before:
+            scale = 0.0
+        if not scale > level or (round > 0 and moved < 1e-8 * scale):
+            break
+    return scale
+
+
 def fit_in(basis: Basis, y: Array) -> Fit:
     """The same in a basis that `orthonormal` made.
 
@@ -153,21 +190,8 @@ def fit_in(basis: Basis, y: Array) -> Fit:
     round, and with it the influence of all other readings: it is 0 then, and theta is not an estimate for them.
     """
     Q, R, size = basis
-    theta: Array = np.zeros(Q.shape[1])
-    weight, scale = np.ones(len(y)), 0.0
-    residual: Array = y
-    level = ROUNDING * float(np.sqrt(np.mean(y * y)))
-    for round in range(ROUNDS):
-        W = Q.T * weight
-        step = np.linalg.solve(invertible(W @ Q), W @ y)
-        moved, theta, residual = float(np.abs(Q @ (step - theta)).max()), step, y - Q @ step
-        before, scale = scale, deviation(residual)
-        vanished = round > 0 and not scale > level
-        if (vanished or round == ROUNDS - 1) and scale < SHRINKING * before:
-            scale = 0.0
-        if not scale > level or (round > 0 and moved < 1e-8 * scale):
-            break
-        weight = CLIP * scale / np.maximum(np.abs(residual), CLIP * scale)
+    theta, residual = np.zeros(Q.shape[1]), np.empty(len(y))
+    scale = float(_fitted(Q, np.ascontiguousarray(y), theta, residual))
     return Fit(np.linalg.lstsq(R, theta, rcond=ROUNDING)[0] / size, residual, scale)
 
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array
-from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.statistics.robust import deviation
+from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.statistics.paired import long_run
+from driftfit.judge.statistics.robust import deviation, scale_of
 
 LOUDER = 1e-3
 """p-value, one-sided, of residuals of one size below which they grow with a regressor."""
@@ -68,19 +68,31 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
 
 
+@Driver
 def ranks(phi: Array) -> Array:
     """Ranks (N, n) of the sizes of every regressor of phi (N, n), equal ones for equal sizes, about their mean."""
-    sizes = [(one, np.sort(one)) for one in np.abs(phi).T]
-    x = [np.searchsorted(known, one, "left") + np.searchsorted(known, one, "right") for one, known in sizes]
-    return np.asarray((np.array(x) - np.mean(x, axis=1, keepdims=True)).T / (2.0 * len(phi)))
+    ranked = np.empty(phi.shape)
+    for j in range(phi.shape[1]):
+        size = np.abs(phi[:, j])
+        known = np.sort(size)
+        ranked[:, j] = np.searchsorted(known, size, "left") + np.searchsorted(known, size, "right")
+        ranked[:, j] = (ranked[:, j] - np.mean(ranked[:, j])) / (2.0 * len(phi))
+    return ranked
+
+
+@Driver
+def _growth(z: Array, ranked: Array) -> Array:
+    """Statistics (n,) of whether residuals z (N,) grow with regressors of these ranks (N, n), normal if they do not."""
+    square, t = np.minimum(np.abs(z), 3.0 * scale_of(z[z != 0.0])) ** 2, np.empty(ranked.shape[1])
+    for j in range(len(t)):
+        d = (square - np.mean(square)) * ranked[:, j]
+        v = len(z) * long_run(d)
+        t[j] = np.sum(d) / np.sqrt(v) if v > 0.0 else -np.inf
+    return t
 
 
 def loudest(z: Array, ranked: Array) -> int | None:
     """The regressor, of those with `ranks` (N, n), with which residuals z (N,) grow most clearly; None if with none."""
-    square = clipped(z) ** 2
-    d = (square - square.mean())[:, None] * ranked
-    total = len(z) * newey_west(d, 0.0)
-    varied = ranked.any(axis=0) & (total > 0.0)
-    p = np.where(varied, scipy.special.ndtr(-d.sum(axis=0) / np.sqrt(np.where(varied, total, 1.0))), 1.0)
-    most = int(np.argmin(p))
-    return most if p[most] * len(p) < LOUDER else None
+    t = _growth(z, ranked) if z.any() else np.full(ranked.shape[1], -np.inf)
+    most = int(np.argmax(t))
+    return most if scipy.special.ndtr(-t[most]) * len(t) < LOUDER else None
