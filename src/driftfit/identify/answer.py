@@ -82,6 +82,7 @@ class ManyIdentified(Printed):
     track: Fleet = field(repr=False)
     verdict: ManyVerdicts = field(repr=False)
     worst: Mapping[Any, Identification]
+    roles: Roles = field(repr=False)
 
     @property
     def headline(self) -> str:
@@ -94,17 +95,24 @@ class ManyIdentified(Printed):
         return int(all(row.drifts is None for row in self.verdict.rows))
 
     def json(self) -> dict[str, Any]:
-        """The records by key, and the clearest as for one record."""
+        """The records by key, and in ``worst`` the clearest as for one record."""
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
         worst = {str(key): one.json() for key, one in self.worst.items()}
-        return {"schema": page.NAME, "headline": self.headline, "records": page.finite(rows), "worst": worst}
+        return {
+            "schema": f"{page.NAME}/records",
+            "headline": self.headline,
+            "records": page.finite(rows),
+            "worst": worst,
+        }
 
     def page(self, path: Any = None) -> str:
         """One page: the table of all records, then the three that move most clearly."""
-        return _written(page.many(self.verdict, self.worst), path)
+        return _written(page.many(self.verdict, self.worst, self.roles), path)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
+        yield Text(
+            f" {len(self.verdict)} records with one structure: {self.model!r}\n {' '.join(page.columns(self.roles))}"
+        )
         yield self.verdict
         for key, one in self.worst.items():
             yield Text(f"\n {key}: {one.headline}")
@@ -192,7 +200,7 @@ def identify(
     verdicts, worst = fleet.verdict(level), {}
     for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
         worst[row.key] = task.judged(found.record(row.key), structure)
-    return ManyIdentified(model, fleet, verdicts, worst)
+    return ManyIdentified(model, fleet, verdicts, worst, found)
 
 
 def check_record(found: Roles) -> None:
@@ -234,7 +242,7 @@ class _Task:
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
         self.progress("searching the structure")
-        y, U, _ = found.centred().spread(max_lag + 1)
+        y, U, _ = (found.centred() if found.by else found).spread(max_lag + 1)  # levels of records may differ
         rng, now = np.random.default_rng(self.seed), monotonic()
         end = now + (self.end - now) / 3.0
         best = search(y, U, max_lag, self.first, end, rng)
@@ -292,7 +300,8 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
     fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
     notes = (
-        *(f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()),
+        "" if found.inputs else f"no input moves, so only its own past can explain {found.output}",
+        *(f"{name} has {count} readings like codes or spikes" for name, count in found.refused.items()),
         *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
         f"{found.missing} readings missing" if found.missing else "",
         f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",

@@ -100,9 +100,10 @@ def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
     cov = inverse @ inverse.T * s2
     memory, found = Memory(float(lags @ theta), float(np.sqrt(lags @ cov @ lags))), []
     rest = 1.0 if memory.root else 1.0 - memory.value
-    for name in known.run.model.input_names:
+    for name in known.run.model.input_names or ("level",):
         gain, least = float(own[name] @ theta) / rest, FOUND * float(np.sqrt(own[name] @ cov @ own[name])) / abs(rest)
         slope = own[name] / rest + (0.0 if memory.root else gain / rest * lags)
+        name = known.run.labels.y if name == "level" else name
         found.append(Effect(name, gain, float(np.sqrt(slope @ cov @ slope)), least))
     return theta, memory, tuple(found)
 

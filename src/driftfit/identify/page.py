@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
 from collections.abc import Mapping
 from html import escape
 from pathlib import PurePath
@@ -14,12 +16,12 @@ import numpy as np
 from driftfit.data.clock import Clock, duration_text
 from driftfit.identify.result import Answer, Move
 from driftfit.identify.roles import Roles
-from driftfit.identify.structure import Shape
+from driftfit.identify.structure import TIED, Shape
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
 from driftfit.models.arx import ARX
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
-from driftfit.show.page import document, facts, opening, picture, points, section, table
+from driftfit.show.page import document, opening, picture, points, section, table
 from driftfit.show.text import WIDTH
 
 if TYPE_CHECKING:
@@ -57,6 +59,8 @@ def duration(answer: Answer, samples: int) -> str:
 
 def delay(answer: Answer, name: str) -> str:
     """The delay of an input, a range where several are as good."""
+    if name == answer.roles.output:
+        return "without inputs"
     low, high = answer.structure.delays[answer.roles.inputs.index(name)]
     first = f"{duration(answer, low)} to " if low < high else ""
     return f"delay {first}{duration(answer, high)}" if high else "at once"
@@ -71,13 +75,19 @@ def headline(answer: Answer) -> str:
         return f"A static curve explains it, nothing moves in time: {curve(answer)}."
     if answer.kind == "no drift found":
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
-        seen = f" In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
-        return f"No drift found in {output} ({p_equals(answer.verdict.p)}).{seen if least else ''}"
+        seen = f"In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
+        return f"No drift found in {output} ({p_equals(answer.verdict.p)}). {seen}"
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
     more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
     text = f"{'; '.join(said[:2])}{more}; tracking {gain}."
     return (f"Both: {curve(answer)}. Besides this: " if answer.kind == "both" else "") + text[0].upper() + text[1:]
+
+
+def units(answer: Answer, name: str) -> str:
+    """The units of an effect, where both are known."""
+    known = [answer.roles.units.get(one) for one in dict.fromkeys((answer.roles.output, name))]
+    return f" {' per '.join(filter(None, known))}" if all(known) else ""
 
 
 def curve(answer: Answer) -> str:
@@ -123,23 +133,26 @@ def chosen(answer: Answer) -> list[str]:
     idle = [name for j, name in enumerate(names) if j not in found.lags]
     steady = [names[j] for j in sorted(found.lags) if moving and names[j] not in moving]
     other = found.forecast and structure_text(answer, found.forecast.shape)
+    lags = f"; sum of the lags of {output} {memory.value:.3f} +- {memory.std:.2g}{root}" if found.na else ""
+    ahead = f"{found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead, on the scale of {output}"
     return [
-        f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of {output} "
-        f"{memory.value:.3f} +- {memory.std:.2g}{root}.",
+        f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.",
         *(
             f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind."
             for shape, b, e in found.second[:1]
         ),
+        *([f"Better: the same of the logarithm of {output}, {ahead}."] if found.log[0] > TIED else []),
         *(f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which),
         *([f"An input at once explains {output} and does not forecast it. A forecast: {other}."] if other else []),
     ]
 
 
-def columns(answer: Answer) -> list[str]:
+def columns(roles: Roles) -> list[str]:
     """The roles, with the options that change them."""
-    roles = answer.roles
+    inputs = f"inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u)"
     clock = f"{roles.clock}, every {interval(roles)} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
-    said = [f"Output {roles.output} (--y); inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u); time {clock}."]
+    by = f"; records by {roles.by} (--by)" if roles.by else ""
+    said = [f"Output {roles.output} (--y); {inputs}; time {clock}{by}."]
     left = ", ".join(f"{name} ({why})" for name, why in roles.why.items())
     return [*said, f"Not inputs: {left}."] if left else said
 
@@ -147,11 +160,11 @@ def columns(answer: Answer) -> list[str]:
 def commands(answer: Answer) -> list[str]:
     """Three lines to copy."""
     model, roles = answer.model, answer.roles
-    inputs = f" --u '{','.join(model.input_names)}'" if model.input_names else ""
-    given = f"{answer.source} --y {roles.output}{inputs} --model {short(model)}"
-    given += f" --time {roles.clock} --dt {interval(roles)}" if roles.clock else ""
-    served = f"driftfit serve {PurePath(answer.source).stem}.toml   # the unit is on the page"
-    return [f"driftfit track {given}", f"driftfit detect {given}", served]
+    each = {"y": roles.output, "u": ",".join(model.input_names), "model": short(model), "time": roles.clock}
+    each |= {"dt": interval(roles)} if roles.clock else {}
+    given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
+    served = f"driftfit serve {shlex.quote(PurePath(answer.source).stem)}.toml   # the unit is on the page"
+    return [*(f"driftfit {verb} {shlex.quote(answer.source)} {given}" for verb in ("track", "detect")), served]
 
 
 def short(model: ARX) -> str:
@@ -167,10 +180,12 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Answer) -> str:
     """The unit of a service, as TOML."""
-    names = ", ".join(f'"{name}"' for name in answer.model.input_names)
-    dt = f'dt = "{answer.roles.dt}"\n' if isinstance(answer.roles.dt, str) else ""
-    return (f'[[unit]]\nname = "{PurePath(answer.source).stem}"\ny = "{answer.roles.output}"\nu = [{names}]\n{dt}'
-            f'model = "{answer.model!r}"\ntracker = "AdaptiveKalman()"\nalarm = {{ every = "1 week" }}\n')  # fmt: skip
+    roles = answer.roles
+    own = {"name": PurePath(answer.source).stem, "y": roles.output, "u": answer.model.input_names}
+    own |= {"dt": roles.dt} if isinstance(roles.dt, str) else {}
+    own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
+    set_ = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
+    return f'[[unit]]\n{set_}alarm = {{ every = "1 week" }}\n'
 
 
 def lines(answer: Answer) -> list[tuple[str, str]]:
@@ -178,15 +193,23 @@ def lines(answer: Answer) -> list[tuple[str, str]]:
     found = [("bold", line) for line in wrap(headline(answer), WIDTH - 1)]
     for one in answer.effects:
         moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-        text = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}, {delay(answer, one.name)}{moved}"
+        size = f"{number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
+        text = f"{answer.effect} {size}, {delay(answer, one.name)}{moved}"
         found.append(("", f"{one.name:<20} {text}"))
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
     rest = {"Data": answer.notes, "Not decided": answer.undecided}
-    said = [*chosen(answer), *columns(answer), *(f"{head}: {'; '.join(each)}." for head, each in rest.items() if each)]
+    said = [
+        *chosen(answer),
+        *columns(answer.roles),
+        *(f"{head}: {'; '.join(each)}." for head, each in rest.items() if each),
+    ]
     found += [("", line) for text in said for line in wrap(text, WIDTH - 1)]
-    return [(style, f" {line}") for style, line in found + [("dim", one) for one in commands(answer)]]
+    found += [
+        ("dim", re.sub(r" (?=--model)", " \\\\\n   ", line, count=len(line) > WIDTH)) for line in commands(answer)
+    ]
+    return [(style, f" {line}") for style, line in found]
 
 
 def finite(value: Any) -> Any:
@@ -208,7 +231,7 @@ def as_json(answer: Answer) -> dict[str, Any]:
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": headline(answer), "why": answer.why,
         "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
-        "structure": {"na": structure.na, "inputs": inputs, "second": second},
+        "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "effects": [one._asdict() for one in answer.effects], "moves": [one._asdict() for one in answer.moves],
         "errors": [one._asdict() for one in answer.errors], "memory": answer.memory._asdict(),
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
@@ -264,11 +287,10 @@ def body(answer: Answer) -> list[str]:
         section("The picture", picture(figure(answer), answer.track, CAPTION)),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
-        section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer)])),
+        section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer.roles)])),
         section("Problems of the data", _listed(answer.notes) or "<p>None.</p>"),
         section("What it could not decide", _listed(open_)),
         section("To go on", f"{copied}<p>The last is a unit for <code>driftfit serve</code>.</p>"),
-        facts([("Model", repr(answer.model))]),
     ]
 
 
@@ -277,11 +299,10 @@ def _listed(sentences: Any) -> str:
 
 
 def _effects(answer: Answer) -> str:
-    rows = [(escape(name), delay(answer, name), number(gain), f"{std:.2g}", number(least))
+    rows = [(escape(name), delay(answer, name), number(gain) + escape(units(answer, name)), f"{std:.2g}", number(least))
             for name, gain, std, least in answer.effects]  # fmt: skip
     heads = ("input", "delay", answer.effect, "+-", "smallest change found")
-    caption = "Effects with constant parameters, in units of the output per unit of the input."
-    return table(caption, heads, rows, (1,)) if rows else ""
+    return table("Effects with constant parameters, in units of the output per unit of the input.", heads, rows, (1,))
 
 
 def _errors(answer: Answer) -> str:
@@ -294,12 +315,12 @@ def _errors(answer: Answer) -> str:
     return table(caption, ("", *heads, "samples"), rows)
 
 
-def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer]) -> str:
+def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer], roles: Roles) -> str:
     """The page of many records: the table first, then those that move most clearly."""
     heads = ("record", "what moves", "p", "q", "error", "of constants", "pays")
     rows = [(escape(str(row.key)), *map(escape, row.cells)) for row in verdict.rows]
     parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences)]
-    parts.append(section("All records", table("The clearest first.", heads, rows, (1,))))
+    parts.append(section("All records", table("The clearest first.", heads, rows, (1,)) + _listed(columns(roles))))
     for key, one in worst.items():
         parts += [f"<h2>{escape(str(key))}</h2>", opening([headline(one)]), *body(one)]
     return document(f"{len(rows)} records", parts)

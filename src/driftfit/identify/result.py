@@ -30,7 +30,8 @@ class Errors(NamedTuple):
 
 class Effect(NamedTuple):
     """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where the
-    output may have a unit root; its standard error; the change half-way that would be found in 4 of 5 records.
+    output may have a unit root; without inputs the level of the output. Its standard error; the change half-way that
+    would be found in 4 of 5 records.
     """
 
     name: str
@@ -104,8 +105,9 @@ class Answer(Printed):
 
     @property
     def effect(self) -> str:
-        """What the effects are: there may be no long run."""
-        return "effect in a sample" if self.memory.root else "static gain"
+        """What the effects are: there may be no long run, and without inputs there is only a level."""
+        lasting = "static gain" if self.model.input_names else "level"
+        return "effect in a sample" if self.memory.root else lasting
 
     @cached_property
     def alarms(self) -> Alarms:

@@ -113,6 +113,8 @@ def roles(
 ) -> Roles:  # fmt: skip
     """The roles of the columns of a table or file; ValueError for names that it does not have, and without a y."""
     frame, units = _frame(data, wanted or Wanted(()))
+    if len(several := [name for name in str(y).split(",") if name in frame.columns]) > 1 and y not in frame.columns:
+        raise ValueError(f"identify: it explains one output; call it for {' and for '.join(several)}.")
     for name in filter(None, (y, time, by, *(u or ()), *not_u, *(limits or ()))):
         if name not in frame.columns:
             raise ValueError(f"identify: no column {name!r}; {near(name, frame.columns)}")

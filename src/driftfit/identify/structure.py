@@ -14,7 +14,7 @@ What is predicted is the present output: with nk = 0 an input explains it, but d
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import monotonic
 
 import numpy as np
@@ -44,7 +44,8 @@ class Structure:
 
     ``delays``: the least and the largest nk that are as good. ``second``: other structures, by how many nats they are
     behind, and the standard error of that. ``doubtful``: inputs that are no better than displaced copies. ``instead``:
-    pairs of an input and one that could replace it. ``forecast``: the same with nk of at least 1, if it is another.
+    pairs of an input and one that could replace it. ``log``: by how many nats the same of the logarithm of a positive
+    output leads, on the scale of the output. ``forecast``: the same with nk of at least 1, if it is another.
     ``narrowed``: where the search was cut short.
     """
 
@@ -54,6 +55,7 @@ class Structure:
     second: tuple[tuple[Shape, float, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     instead: tuple[tuple[int, int], ...] = ()
+    log: tuple[float, float] = (0.0, 0.0)
     forecast: Structure | None = None
     narrowed: str = ""
 
@@ -173,7 +175,7 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     if doubtful:  # the others may need other lags without them
         shape = without(pool.climb(without(shape, doubtful), end), doubtful)
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
-    return _told(pool, shape, doubtful, narrowed)
+    return replace(_told(pool, shape, doubtful, narrowed), log=_of_log(pool, shape, y, U, first))
 
 
 def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
@@ -196,6 +198,18 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) ->
     second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
     lags = {j: (nb, nk) for j, nb, nk in inputs}
     return Structure(na, lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
+
+
+def _of_log(pool: Pool, shape: Shape, y: Array, U: Array, first: int) -> tuple[float, float]:
+    """The lead of a structure of log y over that of y, on the scale of y: d log y = dy / y."""
+    own, S = pool.scores, pool.columns(shape)
+    if not np.all((y > 0.0) | np.isnan(y)):
+        return 0.0, 0.0
+    other = Pool(np.log(y), U, pool.M, first).scores
+    other.refer(S)
+    ends = np.cumsum(own.count).astype(int)
+    slope = np.add.reduceat(np.log(y[pool.rows]), np.append(0, ends[:-1]))
+    return lead(other.terms(S) - own.count * np.log(other.size / own.size) - slope, own.terms(S))
 
 
 def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
