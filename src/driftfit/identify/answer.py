@@ -21,27 +21,24 @@ from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.fleets import Fleet
-from driftfit.identify import page
+from driftfit.identify import page as pages
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
 from driftfit.identify.result import Answer
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
-from driftfit.judge.evidence import Evidence, judged_rows
+from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, judged
 from driftfit.models.arx import ARX
 from driftfit.results import Track
-from driftfit.show.report import check_path
 from driftfit.show.text import Printed
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.tracking import track
 
 LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
-FEEDBACK = 5.0
-"""F statistic above which the output is said to act on an input."""
 RATE, LEAST = 1000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
@@ -52,25 +49,11 @@ WORST = 3
 class Identification(Answer):
     """The result of `identify`, an `Answer`; printing it shows some 25 lines."""
 
-    @property
-    def headline(self) -> str:
-        """The answer in one sentence or two."""
-        return page.headline(self)
-
-    def json(self) -> dict[str, Any]:
-        """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
-        return page.as_json(self)
-
-    def plot(self) -> Any:
-        """The picture of the page; a matplotlib figure."""
-        return page.figure(self)
-
-    def page(self, path: Any = None) -> str:
-        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
-        return _written(page.html(self), path)
+    headline = property(pages.headline)
+    json, plot, page = pages.as_json, pages.figure, pages.html
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for style, line in page.lines(self):
+        for style, line in pages.lines(self):
             yield Text(line, style)
 
 
@@ -83,6 +66,7 @@ class ManyIdentified(Printed):
     verdict: ManyVerdicts = field(repr=False)
     worst: Mapping[Any, Identification]
     roles: Roles = field(repr=False)
+    page = pages.many
 
     @property
     def headline(self) -> str:
@@ -98,30 +82,15 @@ class ManyIdentified(Printed):
         """The records by key, and in ``worst`` the clearest as for one record."""
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
         worst = {str(key): one.json() for key, one in self.worst.items()}
-        return {
-            "schema": f"{page.NAME}/records",
-            "headline": self.headline,
-            "records": page.finite(rows),
-            "worst": worst,
-        }
-
-    def page(self, path: Any = None) -> str:
-        """One page: the table of all records, then the three that move most clearly."""
-        return _written(page.many(self.verdict, self.worst, self.roles), path)
+        shown = {"schema": f"{pages.NAME}/records", "headline": self.headline}
+        return shown | {"records": pages.finite(rows), "worst": worst}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(
-            f" {len(self.verdict)} records with one structure: {self.model!r}\n {' '.join(page.columns(self.roles))}"
-        )
+        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
+        yield Text(" " + "\n ".join(pages.columns(self.roles)))
         yield self.verdict
         for key, one in self.worst.items():
             yield Text(f"\n {key}: {one.headline}")
-
-
-def _written(text: str, path: Any) -> str:
-    if path is not None:
-        check_path(path).write_text(text, encoding="utf-8")
-    return text
 
 
 def identify(
@@ -190,7 +159,7 @@ def identify(
                   wanted=reading)  # fmt: skip
     check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
-    task = _Task(int(forecast), horizon, level, gate, end, seed, progress, source)
+    task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
     if found.by is None:
         return task.judged(found, structure)
@@ -216,8 +185,7 @@ def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles,
     """Roles and structure alone, with the defaults of `identify`."""
     found = roles(data, y, time=time, wanted=reading)
     check_record(found)
-    task = _Task(0, 1, 0.05, None, monotonic() + 45.0, 0, lambda text: None, "")
-    return found, model_of(found, task.structure(found, 30, forecast=False))
+    return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False))
 
 
 def model_of(found: Roles, structure: Structure) -> ARX:
@@ -230,14 +198,14 @@ def model_of(found: Roles, structure: Structure) -> ARX:
 class _Task:
     """The settings of a call."""
 
-    first: int
-    horizon: int
-    level: float
-    gate: bool | None
     end: float
-    seed: int
-    progress: Callable[[str], None]
-    source: str
+    first: int = 0
+    horizon: int = 1
+    level: float = REJECTED
+    gate: bool | None = None
+    seed: int = 0
+    progress: Callable[[str], None] = lambda text: None
+    source: str = ""
 
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
@@ -269,41 +237,34 @@ class _Task:
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
         self.progress("judging")
         verdict = judged(known)
-        moves_besides = bool(verdict.drifts)
-        if moves_besides and why_not.products:
+        besides = bool(verdict.drifts)
+        if besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
-            besides = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
-            moves_besides = besides is None or besides.rejected
+            again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
+            besides = again is None or again.rejected
         theta, memory, own = effects(known)
-        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
-        kind, why = self._kind(found, run, verdict, why_not.kind(moves_besides))
-        return Identification(
-            kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
-            memory, errors_of(known, self.horizon), notes, undecided, self.source,
-        )  # fmt: skip
-
-    def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:
-        """The answer in a word, and why there is none."""
-        share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
+        moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
+        why, share = verdict.untested, 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
         if share > 100.0 * LEFT_OUT and self.gate is None:
             codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
-            return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
-        if verdict.drifts is None:
-            return page.KINDS[4], verdict.untested
-        moving = {"working point": 1, "both": 2}.get(kind, 0)
-        return page.KINDS[moving if verdict.drifts or moving == 1 else 3], ""
+            why = f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
+        moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
+        kind = pages.KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
+        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
+                              notes, undecided, self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
     """Problems of the data, each in a few words."""
-    fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
+    fed = [j for j in structure.lags if feedback(y, U[:, j])]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
     notes = (
         "" if found.inputs else f"no input moves, so only its own past can explain {found.output}",
-        *(f"{name} has {count} readings like codes or spikes" for name, count in found.refused.items()),
+        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
         *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
-        f"{found.missing} readings missing" if found.missing else "",
+        f"missing readings: {found.missing}" if found.missing else "",
         f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
         *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
         structure.narrowed,

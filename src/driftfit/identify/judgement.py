@@ -15,8 +15,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.identify.result import Effect, Errors, Memory, Move
-from driftfit.identify.scores import FEWEST
-from driftfit.identify.structure import filled, lagged
+from driftfit.identify.structure import Pool, lagged
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import LEAST
@@ -138,12 +137,8 @@ def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move,
     return tuple(found)
 
 
-def feedback(y: Array, u: Array) -> float:
-    """F statistic of three lags of y in a regression of u on three lags of itself and of y: over 5 is feedback."""
-    X = np.column_stack([np.ones(len(y)), *(lagged(filled(x), k) for x in (u, y) for k in (1, 2, 3))])
-    rows = np.isfinite(X).all(axis=1) & np.isfinite(u)
-    X, z = X[rows], u[rows]
-    if len(z) < FEWEST or np.ptp(z) == 0.0:
-        return 0.0
-    full, less = (float(np.sum((z - A @ (pseudo_inverse(A) @ z)) ** 2)) for A in (X, X[:, :4]))
-    return (less - full) / 3.0 / max(full / (len(z) - 7), SMALL)
+def feedback(y: Array, u: Array) -> bool:
+    """Whether y (T,) acts on an input u (T,): three lags of y beside three of u are worth their price."""
+    pool = Pool(u, y[:, None], 3, 1, 3)
+    pool.scores.refer(pool.columns((3, ())))
+    return pool.value((3, ((0, 3, 1),))) > pool.value((3, ()))

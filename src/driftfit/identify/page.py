@@ -17,11 +17,11 @@ from driftfit.data.clock import Clock, duration_text
 from driftfit.identify.result import Answer, Move
 from driftfit.identify.roles import Roles
 from driftfit.identify.structure import TIED, Shape
-from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import p_equals
 from driftfit.models.arx import ARX
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, opening, picture, points, section, table
+from driftfit.show.report import check_path
 from driftfit.show.text import WIDTH
 
 if TYPE_CHECKING:
@@ -37,10 +37,8 @@ PROPERTIES: dict[str, Any] = {
 }  # fmt: skip
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
-CAPTION = (
-    "Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with its 95 % "
-    "band, from the past only. Red: when it changed."
-)
+CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with its
+95 % band, from the past only. Red: when it changed."""
 
 
 def number(value: float) -> str:
@@ -130,21 +128,19 @@ def chosen(answer: Answer) -> list[str]:
     """What was chosen, and what came second."""
     found, names, memory, output = answer.structure, answer.roles.inputs, answer.memory, answer.roles.output
     moving, root = {move.what for move in answer.moves}, ": perhaps a unit root" if memory.root else ""
-    idle = [name for j, name in enumerate(names) if j not in found.lags]
-    steady = [names[j] for j in sorted(found.lags) if moving and names[j] not in moving]
+    idle = ", ".join(name for j, name in enumerate(names) if j not in found.lags)
+    steady = ", ".join(names[j] for j in sorted(found.lags) if moving and names[j] not in moving)
     other = found.forecast and structure_text(answer, found.forecast.shape)
     lags = f"; sum of the lags of {output} {memory.value:.3f} +- {memory.std:.2g}{root}" if found.na else ""
-    ahead = f"{found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead, on the scale of {output}"
-    return [
-        f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.",
-        *(
-            f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind."
-            for shape, b, e in found.second[:1]
-        ),
-        *([f"Better: the same of the logarithm of {output}, {ahead}."] if found.log[0] > TIED else []),
-        *(f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which),
-        *([f"An input at once explains {output} and does not forecast it. A forecast: {other}."] if other else []),
-    ]
+    logged = f"the same of the logarithm of {output}, {found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead"
+    said = [f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind." for shape, b, e in found.second]
+    told = (
+        f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.", *said[:1],
+        found.log[0] > TIED and f"Better: {logged}, on the scale of {output}.",
+        steady and f"Constant: {steady}.", idle and f"Not needed: {idle}.",
+        other and f"An input at once explains {output} and does not forecast it. A forecast: {other}.",
+    )  # fmt: skip
+    return [one for one in told if one]
 
 
 def columns(roles: Roles) -> list[str]:
@@ -184,8 +180,8 @@ def unit(answer: Answer) -> str:
     own = {"name": PurePath(answer.source).stem, "y": roles.output, "u": answer.model.input_names}
     own |= {"dt": roles.dt} if isinstance(roles.dt, str) else {}
     own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
-    set_ = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
-    return f'[[unit]]\n{set_}alarm = {{ every = "1 week" }}\n'
+    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
+    return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
 
 
 def lines(answer: Answer) -> list[tuple[str, str]]:
@@ -200,20 +196,17 @@ def lines(answer: Answer) -> list[tuple[str, str]]:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
     rest = {"Data": answer.notes, "Not decided": answer.undecided}
-    said = [
-        *chosen(answer),
-        *columns(answer.roles),
-        *(f"{head}: {'; '.join(each)}." for head, each in rest.items() if each),
+    said = [f"{head}: {'; '.join(each)}." for head, each in rest.items() if each]
+    said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
+    short = [line if len(line) < WIDTH else line.replace(" --model", " \\\n   --model") for line in commands(answer)]
+    return [
+        (style, f" {line}") for style, line in (*found, *(("", one) for one in said), *(("dim", one) for one in short))
     ]
-    found += [("", line) for text in said for line in wrap(text, WIDTH - 1)]
-    found += [
-        ("dim", re.sub(r" (?=--model)", " \\\\\n   ", line, count=len(line) > WIDTH)) for line in commands(answer)
-    ]
-    return [(style, f" {line}") for style, line in found]
 
 
 def finite(value: Any) -> Any:
     """Plain data: lists, strings, numbers, and None for numbers that are not finite."""
+    value = value._asdict() if hasattr(value, "_asdict") else value
     if isinstance(value, Mapping):
         return {str(key): finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -223,26 +216,24 @@ def finite(value: Any) -> Any:
 
 
 def as_json(answer: Answer) -> dict[str, Any]:
-    """The answer in the form of `SCHEMA`."""
+    """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
     shown = ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
     found: dict[str, Any] = finite({
-        "schema": NAME, "answer": answer.kind, "headline": headline(answer), "why": answer.why,
+        "schema": NAME, "answer": answer.kind, "headline": headline(answer),
         "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
-        "effects": [one._asdict() for one in answer.effects], "moves": [one._asdict() for one in answer.moves],
-        "errors": [one._asdict() for one in answer.errors], "memory": answer.memory._asdict(),
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
-        "notes": answer.notes, "undecided": answer.undecided, "commands": commands(answer),
-        "unit": unit(answer),
+        "commands": commands(answer), "unit": unit(answer),
+        **{name: getattr(answer, name) for name in ("why", "effects", "moves", "errors", "memory", "notes", "undecided")},
     })  # fmt: skip
     return found
 
 
 def figure(answer: Answer) -> Figure:
-    """The output with its prediction, and the static gain of the first four inputs with dates of changes."""
+    """The picture of the page: the output with its prediction, and the static gain of the first four inputs."""
     run, shown = answer.track, answer.model.input_names[:4]
     drawn, axes = panels(None, (9.5, 2.4 + 1.6 * max(len(shown), 1)), 1 + len(shown), sharex=True)
     draw_prediction(axes[0], run)
@@ -263,12 +254,19 @@ def figure(answer: Answer) -> Figure:
     return drawn
 
 
-def html(answer: Answer) -> str:
-    """The page."""
+def html(answer: Answer, path: Any = None) -> str:
+    """The answer as one self-contained HTML page; with a ``path`` it is written there."""
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
     subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
     first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([headline(answer)])}'
-    return document(heading, [first, *body(answer)])
+    return _written(heading, [first, *body(answer)], path)
+
+
+def _written(heading: str, parts: list[str], path: Any) -> str:
+    text = document(heading, parts)
+    if path is not None:
+        check_path(path).write_text(text, encoding="utf-8")
+    return text
 
 
 def body(answer: Answer) -> list[str]:
@@ -315,12 +313,12 @@ def _errors(answer: Answer) -> str:
     return table(caption, ("", *heads, "samples"), rows)
 
 
-def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer], roles: Roles) -> str:
-    """The page of many records: the table first, then those that move most clearly."""
-    heads = ("record", "what moves", "p", "q", "error", "of constants", "pays")
+def many(answer: Any, path: Any = None) -> str:
+    """One page: the table of all records, then the three that move most clearly."""
+    heads, verdict = ("record", "what moves", "p", "q", "error", "of constants", "pays"), answer.verdict
     rows = [(escape(str(row.key)), *map(escape, row.cells)) for row in verdict.rows]
-    parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences)]
-    parts.append(section("All records", table("The clearest first.", heads, rows, (1,)) + _listed(columns(roles))))
-    for key, one in worst.items():
+    shown = table("The clearest first.", heads, rows, (1,)) + _listed(columns(answer.roles))
+    parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences), section("All records", shown)]
+    for key, one in answer.worst.items():
         parts += [f"<h2>{escape(str(key))}</h2>", opening([headline(one)]), *body(one)]
-    return document(f"{len(rows)} records", parts)
+    return _written(f"{len(rows)} records", parts, path)
