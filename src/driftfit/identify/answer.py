@@ -9,31 +9,25 @@ predictions made before the sample. Cost: for T rows and p columns of lags, O(T 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.text import Text
 
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.fleets import Fleet
-from driftfit.identify import page as pages
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
-from driftfit.identify.result import Answer
+from driftfit.identify.page import KINDS, Identification, ManyIdentified
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
-from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, judged
 from driftfit.models.arx import ARX
 from driftfit.results import Track
-from driftfit.show.text import Printed
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.tracking import track
 
@@ -43,54 +37,6 @@ RATE, LEAST = 1000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
 """Records of a fleet that have a page."""
-
-
-@dataclass(frozen=True)
-class Identification(Answer):
-    """The result of `identify`, an `Answer`; printing it shows some 25 lines."""
-
-    headline = property(pages.headline)
-    json, plot, page = pages.as_json, pages.figure, pages.html
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for style, line in pages.lines(self):
-            yield Text(line, style)
-
-
-@dataclass(frozen=True)
-class ManyIdentified(Printed):
-    """The result of `identify` for records with one structure: the fleet, its verdicts, the clearest three by key."""
-
-    model: ARX
-    track: Fleet = field(repr=False)
-    verdict: ManyVerdicts = field(repr=False)
-    worst: Mapping[Any, Identification]
-    roles: Roles = field(repr=False)
-    page = pages.many
-
-    @property
-    def headline(self) -> str:
-        """The answer in a sentence."""
-        return self.verdict.sentences[0]
-
-    @property
-    def code(self) -> int:
-        """Exit code of the command: 1 if no record could be judged."""
-        return int(all(row.drifts is None for row in self.verdict.rows))
-
-    def json(self) -> dict[str, Any]:
-        """The records by key, and in ``worst`` the clearest as for one record."""
-        rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
-        worst = {str(key): one.json() for key, one in self.worst.items()}
-        shown = {"schema": f"{pages.NAME}/records", "headline": self.headline}
-        return shown | {"records": pages.finite(rows), "worst": worst}
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
-        yield Text(" " + "\n ".join(pages.columns(self.roles)))
-        yield self.verdict
-        for key, one in self.worst.items():
-            yield Text(f"\n {key}: {one.headline}")
 
 
 def identify(
@@ -250,7 +196,7 @@ class _Task:
             codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
             why = f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
-        kind = pages.KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
+        kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
         notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
         return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
                               notes, undecided, self.source)  # fmt: skip

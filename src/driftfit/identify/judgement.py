@@ -11,10 +11,11 @@ by what is known h steps before.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.identify.result import Effect, Errors, Memory, Move
 from driftfit.identify.structure import Pool, lagged
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
@@ -27,6 +28,50 @@ from driftfit.run.result import Track, root_mean_square
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
+
+
+class Errors(NamedTuple):
+    """Root mean square errors ``steps`` ahead, by method, on ``samples`` samples."""
+
+    steps: int
+    rms: dict[str, float]
+    samples: int
+
+
+class Effect(NamedTuple):
+    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where the
+    output may have a unit root; without inputs the level of the output. Its standard error; the change half-way that
+    would be found in 4 of 5 records.
+    """
+
+    name: str
+    gain: float
+    std: float
+    least: float
+
+
+class Memory(NamedTuple):
+    """Sum of the lags of y with its standard error; ``root``: whether 1 is within two of them."""
+
+    value: float
+    std: float
+
+    @property
+    def root(self) -> bool:
+        return self.value + 2.0 * self.std >= 1.0
+
+
+class Move(NamedTuple):
+    """What an event did to one effect: the static gain of an input, the ``memory`` (sum of a) or the ``level``."""
+
+    what: str
+    kind: str
+    before: float
+    after: float
+    first: str
+    last: str
+    at: int
+    instead: tuple[str, ...]
 
 
 def density(e: Array) -> Array:

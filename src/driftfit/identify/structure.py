@@ -183,15 +183,12 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) ->
     own, (na, inputs) = pool.scores.terms(pool.columns(shape)), shape
     base, delays, instead = float(own.sum()), {}, []
     for j, nb, nk in inputs:
-        rest, ends = without(shape, (j,))[1], []
-        for step in (-1, 1):
-            k = nk
-            while (
-                pool.fits(near := (na, (*rest, (j, nb, k + step))))
-                and base - pool.scores.score(pool.columns(near)) < TIED
-            ):
-                k += step
-            ends.append(k)
+        rest, ends = without(shape, (j,))[1], [nk, nk]
+        for side, step in enumerate((-1, 1)):
+            while pool.fits(near := (na, (*rest, (j, nb, ends[side] + step)))):
+                if base - pool.scores.score(pool.columns(near)) >= TIED:
+                    break
+                ends[side] += step
         delays[j] = ends[0], ends[1]
         instead += [(j, i) for i, (score, _) in pool.best_delays((na, rest)).items() if i != j and base - score < TIED]
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
