@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
-from driftfit.identify.judgement import ahead, density, weights
+from driftfit.identify.judgement import Move, ahead, density, weights
 from driftfit.identify.page import SCHEMA, commands, verb
-from driftfit.identify.result import Move
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
-from driftfit.identify.structure import Structure, lagged, search
+from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
+from driftfit.use.simulate import moved
 
 PUMP = str(files("driftfit.demo") / "pump.csv")
 T = 900
@@ -42,7 +42,7 @@ def plant(change, seed=0):
 
 def regressors(y, U):
     """phi (T, 4) of the plant."""
-    return np.column_stack([lagged(y, 1), lagged(U[:, 0], 6), U[:, 1], np.ones(T)])
+    return np.column_stack([moved(y, 1), moved(U[:, 0], 6), U[:, 1], np.ones(T)])
 
 
 def searched(y, U, first=0, budget=60.0):

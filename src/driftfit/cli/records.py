@@ -41,12 +41,12 @@ from driftfit.data.tables import read_records
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
-from driftfit.identify.answer import Identification, ManyIdentified, chosen, identify
-from driftfit.identify.page import interval, short
+from driftfit.identify.answer import chosen, identify
+from driftfit.identify.page import Identification, ManyIdentified, interval
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
-from driftfit.parsing.settings import given_fields
+from driftfit.parsing.settings import arx_text, given_fields
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.run.live.conformal import quantile
@@ -104,7 +104,7 @@ def _with_structure(given: Given) -> Given:
     """The options with the inputs, the structure and the time that `driftfit identify` finds."""
     with progress.status("searching the structure"):
         found, model = chosen(given.file[0], given.outputs[0], given.time, given.wanted)
-    text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
+    text, inputs = arx_text(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
     say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
     dt = given.dt or (interval(found) if found.clock else None)
     return replace(given, model=[text], u=list(model.input_names), time=found.clock, dt=dt)

@@ -46,7 +46,7 @@ def identify(
     horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
     reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
 ) -> Identification | ManyIdentified:  # fmt: skip
-    """From a table to an answer: roles, structure, drift and its cause.
+    """From a table to an answer: roles, structure, drift and its cause; `ManyIdentified` for several records.
 
     Parameters
     ----------
@@ -61,48 +61,36 @@ def identify(
         Nominal interval, as for `track`; the median by default.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
-    max_lag : int
-        Longest lag of an input.
+    max_lag, horizon : int
+        Longest lag of an input; steps ahead of the second comparison of errors.
     forecast : bool
-        Only inputs of earlier samples (nk of at least 1). By default an input of the same sample may explain y, and
-        the forecast is said beside it.
-    horizon : int
-        Steps ahead of the second comparison of errors.
+        Only inputs of earlier samples. By default one of the same sample may explain y; a forecast is said beside it.
     level : number
         Error rate of the statement that parameters move.
     gate : bool or None
-        As for `track`. None: the gate of the default tracker, but there is no answer where it, or `roles`, leaves out
-        more than `LEFT_OUT` of the readings.
+        As for `track`. None: that of the default tracker, and no answer if more than `LEFT_OUT` of the readings go.
     budget : number
-        Seconds for one record. The search stops after a third of them, and then the last samples are judged of which
-        the verdict is expected to take no more than what is left. For several records it is that of the search.
-    seed : int
-        That of the displaced copies of inputs.
+        Seconds for one record. The search stops after a third of them; then as many of the last samples are judged as
+        are expected to take what is left. For several records it is that of the search.
+    seed, progress : int, callable
+        Seed of the displaced copies of inputs; told what is being done.
     reading : Wanted or None
         How a CSV file is read: decimal sign, separator, form of dates, words for missing values.
-    progress : callable
-        Told what is being done.
-
-    Returns
-    -------
-    Identification, or ManyIdentified for a table with several records.
 
     Raises
     ------
     ValueError
-        For columns that do not exist, an output that is not named and not obvious, and everything that `track` does
-        not accept.
+        For columns that do not exist, an output that is not named and not obvious, and what `track` does not accept.
     driftfit.identify.roles.NoAnswerError
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
-    for name, value in (("max_lag", max_lag), ("horizon", horizon)):
-        whole("identify", name, value, 1)
+    max_lag, horizon = whole("identify", "max_lag", max_lag, 1), whole("identify", "horizon", horizon, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
-    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
-                  wanted=reading)  # fmt: skip
+    codes = gate is not False
+    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=codes, wanted=reading)
     check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
@@ -113,8 +101,9 @@ def identify(
     model = model_of(found, structure)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
     verdicts, worst = fleet.verdict(level), {}
-    for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
-        worst[row.key] = task.judged(found.record(row.key), structure)
+    for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
+        at = np.flatnonzero([one == key for one in found.key])
+        worst[key] = task.judged(replace(found.rows(at), by=None), structure)
     return ManyIdentified(model, fleet, verdicts, worst, found)
 
 
@@ -197,9 +186,9 @@ class _Task:
             why = f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
-        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
+        said = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
         return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
-                              notes, undecided, self.source)  # fmt: skip
+                              *said, self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
@@ -220,10 +209,10 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
     """What the record does not decide, each in a few words."""
-    ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
     return (
-        *(f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges),
+        *(f"the delay of {names[j]}: {low} to {high} samples are as good"
+          for j, (low, high) in structure.delays.items() if low < high),
         *(f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead),
         *(f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful),
         *(["a level that wanders, or noise that does"] if verdict.nearly_walk else []),
-    )
+    )  # fmt: skip

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.identify.structure import Pool, lagged
+from driftfit.identify.structure import Pool
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import LEAST
@@ -24,6 +24,7 @@ from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
 from driftfit.judge.structures.candidates import weigh
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
+from driftfit.use.simulate import moved
 
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
@@ -39,9 +40,8 @@ class Errors(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where the
-    output may have a unit root; without inputs the level of the output. Its standard error; the change half-way that
-    would be found in 4 of 5 records.
+    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where there may
+    be a unit root; without inputs the level. Its standard error; the change half-way found in 4 of 5 records.
     """
 
     name: str
@@ -94,24 +94,23 @@ def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
     and regressors that are given."""
     made: list[Array] = []
     for s in range(h):
-        now = np.vstack([phi[s:], np.full((min(s, len(phi)), phi.shape[1]), np.nan)])
+        now = moved(phi, -s)
         for i in range(min(s, na)):
             now[:, i] = made[s - 1 - i]
         made.append(np.einsum("tn,tn->t", theta, now))
-    return lagged(made[-1], h - 1)
+    return moved(made[-1], h - 1)
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
     run, own, steady, found = known.run, known.errors, known.steady, []
     y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
-    none = np.full((1, run.model.n), np.nan)
-    paths = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
+    paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
     far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
     cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
     if horizon > 1:
-        last = {"persistence": y - lagged(persistence(y), horizon - 1)}
+        last = {"persistence": y - moved(persistence(y), horizon - 1)}
         cases.append((horizon, far[0], far[1], density(far[0]), last))
     for h, tracked, constants, likely, others in cases:
         w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
+from itertools import groupby
 from pathlib import PurePath
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.data.clock import Clock, duration_text
+from driftfit.data.clock import Clock
 from driftfit.fleets import Fleet
 from driftfit.identify.judgement import Effect, Errors, Memory, Move
 from driftfit.identify.roles import Roles
@@ -29,10 +29,11 @@ from driftfit.judge.verdict import Verdict, p_equals
 from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.parsing.settings import arx_text
 from driftfit.results import Track
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, opening, picture, points, section, table
-from driftfit.show.report import check_path
+from driftfit.show.report import written
 from driftfit.show.text import WIDTH, Printed
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
@@ -59,22 +60,14 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def duration(answer: Identification, samples: int) -> str:
-    """A number of samples, where the record has dates as a time."""
-    clock = Clock.of(answer.roles.dt) if isinstance(answer.roles.dt, str) else Clock("number")
-    if clock.duration is not None:
-        return re.sub(r"(?<=\d)(?=\D)", " ", duration_text(samples * clock.duration))
-    count = int(samples * clock.count)
-    return f"{count} {'sample' if clock.kind == 'number' else clock.kind}{'' if count == 1 else 's'}"
-
-
 def delay(answer: Identification, name: str) -> str:
     """The delay of an input, a range where several are as good."""
     if name == answer.roles.output:
         return "without inputs"
     low, high = answer.structure.delays[answer.roles.inputs.index(name)]
-    first = f"{duration(answer, low)} to " if low < high else ""
-    return f"delay {first}{duration(answer, high)}" if high else "at once"
+    clock = Clock.of(answer.roles.dt or 1.0)
+    first = f"{clock.lasting(low)} to " if low < high else ""
+    return f"delay {first}{clock.lasting(high)}" if high else "at once"
 
 
 def conclusion(answer: Identification) -> str:
@@ -109,8 +102,7 @@ def curve(answer: Identification) -> str:
 
 def sentences(answer: Identification) -> list[str]:
     """What every event did."""
-    events = dict.fromkeys((move.kind, move.at) for move in answer.moves)
-    return [_event(answer, [move for move in answer.moves if (move.kind, move.at) == one]) for one in events]
+    return [_event(answer, [*own]) for _, own in groupby(answer.moves, lambda move: (move.kind, move.at))]
 
 
 def _event(answer: Identification, own: list[Move]) -> str:
@@ -169,17 +161,11 @@ def columns(roles: Roles) -> list[str]:
 def commands(answer: Identification) -> list[str]:
     """Three lines to copy."""
     model, roles = answer.model, answer.roles
-    each = {"y": roles.output, "u": ",".join(model.input_names), "model": short(model), "time": roles.clock}
+    each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
     given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
     served = f"driftfit serve {shlex.quote(PurePath(answer.source).stem)}.toml   # the unit is on the page"
     return [*(f"driftfit {verb} {shlex.quote(answer.source)} {given}" for verb in ("track", "detect")), served]
-
-
-def short(model: ARX) -> str:
-    """A model as the option --model."""
-    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
-    return f"arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
 
 
 def interval(roles: Roles) -> str:
@@ -202,9 +188,8 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     found = [("bold", line) for line in wrap(conclusion(answer), WIDTH - 1)]
     for one in answer.effects:
         moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-        size = f"{number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
-        text = f"{answer.effect} {size}, {delay(answer, one.name)}{moved}"
-        found.append(("", f"{one.name:<20} {text}"))
+        size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
+        found.append(("", f"{one.name:<20} {size}, {delay(answer, one.name)}{moved}"))
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
@@ -273,14 +258,7 @@ def html(answer: Identification, path: Any = None) -> str:
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
     subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
     first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([conclusion(answer)])}'
-    return _written(heading, [first, *body(answer)], path)
-
-
-def _written(heading: str, parts: list[str], path: Any) -> str:
-    text = document(heading, parts)
-    if path is not None:
-        check_path(path).write_text(text, encoding="utf-8")
-    return text
+    return written(document(heading, [first, *body(answer)]), path)
 
 
 def body(answer: Identification) -> list[str]:
@@ -289,9 +267,8 @@ def body(answer: Identification) -> list[str]:
     leads = (f"{name} {one[0]:.1f} +- {one[1]:.1f}" for name, one in
              (("tracked parameters", cause.tracked), ("a curve", cause.curve), ("both", cause.joint)))  # fmt: skip
     if answer.kind in KINDS[1:3] and answer.model.input_names:
-        signals = f"y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
-        call = f"track({answer.curve.model!r}, RLS(1.0), {signals})"
-        curve = f"<p>A model with that curve, fitted:</p><pre>{escape(call)}</pre>"
+        signals = f"RLS(1.0), y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
+        curve = f"<p>That curve, fitted:</p><pre>{escape(f'track({answer.curve.model!r}, {signals})')}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
@@ -335,7 +312,7 @@ def page_of_many(answer: ManyIdentified, path: Any = None) -> str:
     parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences), section("All records", shown)]
     for key, one in answer.worst.items():
         parts += [f"<h2>{escape(str(key))}</h2>", opening([conclusion(one)]), *body(one)]
-    return _written(f"{len(rows)} records", parts, path)
+    return written(document(f"{len(rows)} records", parts), path)
 
 
 @dataclass(frozen=True)

@@ -67,10 +67,6 @@ class Roles:
         time = None if self.time is None else self.time[at]
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at))
 
-    def record(self, key: Any) -> Roles:
-        """The rows of one key."""
-        return replace(self.rows(np.array([t for t, one in enumerate(self.key) if one == key])), by=None)
-
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
         parts = [np.flatnonzero(self.groups == k) for k in range(self.groups.max() + 1)]
@@ -139,7 +135,7 @@ def roles(
             why[name] = reason
         else:
             kept.append(name)
-    key, by = _key(frame, texts, by, axis)
+    key, by = _key(frame, [name for name in texts if name not in not_u], by, axis)
     why |= {name: "text" for name in texts if name != by}
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}

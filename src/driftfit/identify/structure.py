@@ -14,7 +14,7 @@ What is predicted is the present output: with nk = 0 an input explains it, but d
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from time import monotonic
 
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.scores import FEWEST, Scores, lead
+from driftfit.use.simulate import moved
 
 COLUMN = 1.5
 """Price of a column in nats, about half the logarithm of the rows that a coefficient needs."""
@@ -72,11 +73,6 @@ def filled(x: Array) -> Array:
     return np.where((t - last <= FILLED) & np.isfinite(x[last]), x[last], np.nan)
 
 
-def lagged(x: Array, k: int) -> Array:
-    """A signal k samples ago."""
-    return np.concatenate([np.full(k, np.nan), x[: len(x) - k]])
-
-
 class Pool:
     """All columns of a record on a regular grid: 1, na lags of y (T,), lags first..M of every column of U (T, m)."""
 
@@ -88,7 +84,7 @@ class Pool:
         for j, x in [(-1, past), *enumerate(U.T)]:
             for k in range(1, na + 1) if j < 0 else range(first, M + 1):
                 self.place[j, k] = len(columns)
-                columns.append(lagged(x, k))
+                columns.append(moved(x, k))
         X = np.column_stack([*columns, *([] if more is None else [more])])
         self.rows = np.flatnonzero(np.isfinite(X).all(axis=1) & np.isfinite(y))
         if len(self.rows) < FEWEST:
@@ -102,9 +98,8 @@ class Pool:
         return [0, *each, *(self.place[j, k] for j, nb, nk in inputs for k in range(nk, nk + nb))]
 
     def fits(self, shape: Shape) -> bool:
-        na, inputs = shape
-        return 0 <= na <= self.na and all(nb >= 1 and (j, nk) in self.place and nk + nb - 1 <= self.M
-                                          for j, nb, nk in inputs)  # fmt: skip
+        inside = (nb >= 1 and (j, nk) in self.place and nk + nb - 1 <= self.M for j, nb, nk in shape[1])
+        return 0 <= shape[0] <= self.na and all(inside)
 
     def value(self, shape: Shape) -> float:
         """The score less the price."""
@@ -175,10 +170,10 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     if doubtful:  # the others may need other lags without them
         shape = without(pool.climb(without(shape, doubtful), end), doubtful)
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
-    return replace(_told(pool, shape, doubtful, narrowed), log=_of_log(pool, shape, y, U, first))
+    return _told(pool, shape, doubtful, _of_log(pool, shape, y, U, first), narrowed)
 
 
-def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
+def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float, float], narrowed: str) -> Structure:
     """A structure with its rivals."""
     own, (na, inputs) = pool.scores.terms(pool.columns(shape)), shape
     base, delays, instead = float(own.sum()), {}, []
@@ -194,7 +189,7 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) ->
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
     second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
     lags = {j: (nb, nk) for j, nb, nk in inputs}
-    return Structure(na, lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
+    return Structure(na, lags, delays, second, doubtful, tuple(instead), log, narrowed=narrowed)
 
 
 def _of_log(pool: Pool, shape: Shape, y: Array, U: Array, first: int) -> tuple[float, float]:
@@ -204,8 +199,7 @@ def _of_log(pool: Pool, shape: Shape, y: Array, U: Array, first: int) -> tuple[f
         return 0.0, 0.0
     other = Pool(np.log(y), U, pool.M, first).scores
     other.refer(S)
-    ends = np.cumsum(own.count).astype(int)
-    slope = np.add.reduceat(np.log(y[pool.rows]), np.append(0, ends[:-1]))
+    slope = np.add.reduceat(np.log(y[pool.rows]), np.cumsum(own.count).astype(int) - own.count.astype(int))
     return lead(other.terms(S) - own.count * np.log(other.size / own.size) - slope, own.terms(S))
 
 
@@ -224,8 +218,8 @@ def _beats_copies(y: Array, U: Array, shape: Shape, j: int, rng: np.random.Gener
     x = filled(U[:, j])
     x, copies = np.where(np.isfinite(x), x, np.nanmean(x)), []
     for k in range(COPIES):
-        moved = np.roll([x, x[::-1]], int(rng.integers(T // 10, T - T // 10)))[0][:: 1 if k % 2 else -1]
-        copies += [np.roll(moved, lag) for lag in range(0, 24, 3)]
+        other = np.roll([x, x[::-1]], int(rng.integers(T // 10, T - T // 10)))[0][:: 1 if k % 2 else -1]
+        copies += [np.roll(other, lag) for lag in range(0, 24, 3)]
     depth = max(nb + nk - 1 for _, nb, nk in shape[1])
     pool = Pool(y, U[:, used], max(depth, 1), na=max(shape[0], 1), more=np.column_stack(copies))
     base = pool.columns((shape[0], tuple((used.index(i), nb, nk) for i, nb, nk in without(shape, (j,))[1])))
