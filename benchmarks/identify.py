@@ -192,9 +192,12 @@ def ours(plant: Plant) -> Found:
         more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]), lags=None)
         again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
         moves = again is None or again.rejected
-    kind = why.kind(moves)
+    kind, agreed = why.kind(moves), True
+    if moves and best.second:  # the structure that came second must say so, too
+        (na, used), *_ = best.second[0]
+        agreed = Judged.of(plant, Structure(na, {j: (nb, nk) for j, nb, nk in used})).changes.rejected
     inputs = {record.inputs[j]: ends for j, ends in best.delays.items()}
-    moves = one.changes.rejected and kind != "working point"
+    moves = one.changes.rejected and kind != "working point" and agreed
     return one.found._replace(inputs=inputs, moves=moves, cause=kind if moves or kind == "working point" else "")
 
 

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
-from driftfit.identify.judgement import Move, ahead, density, weights
+from driftfit.identify.judgement import Move, density, weights
 from driftfit.identify.page import SCHEMA, commands, verb
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
 from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
-from driftfit.use.simulate import moved
+from driftfit.use.simulate import moved, steps_ahead
 
 PUMP = str(files("driftfit.demo") / "pump.csv")
 T = 900
@@ -190,8 +190,8 @@ def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
     y, U = plant("time")
     phi, theta = regressors(y, U), np.random.default_rng(3).normal(size=(T, 4))
     t = 700
-    assert ahead(theta, phi, 1, 1)[t] == pytest.approx(theta[t] @ phi[t])
-    assert ahead(theta, phi, 1, 2)[t + 1] == pytest.approx(theta[t] @ [theta[t] @ phi[t], *phi[t + 1, 1:]])
+    assert steps_ahead(theta, phi, 1, 1)[t] == pytest.approx(theta[t] @ phi[t])
+    assert steps_ahead(theta, phi, 1, 2)[t + 1] == pytest.approx(theta[t] @ [theta[t] @ phi[t], *phi[t + 1, 1:]])
     good, bad = np.random.default_rng(5).normal(size=(2, T)) * [[0.5], [2.0]]
     early = np.arange(T) < T // 2
     first, second = np.where(early, good, bad), np.where(early, bad, good)
@@ -247,6 +247,7 @@ def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
 CODES = {
     "no such column": (["--y", "flux"], 2, "no column 'flux'"),
     "no output named": ([], 2, "name the output with --y"),
+    "two outputs": (["--y", "flow,speed"], 2, "it explains one output; call it for flow and for speed"),
     "too few rows": (["--y", "flow", "--limits", "flow=0:11"], 3, "24 rows of 800 have all lags; at least 60"),
     "constant output": (["--y", "pump"], 3, "pump is 1 in all 800 rows"),
     "text": (["--y", "time", "--time", "speed"], 3, "holds text"),
@@ -254,10 +255,13 @@ CODES = {
 
 
 @pytest.mark.parametrize("what", CODES)
-def test_exit_codes_of_the_command(what):
+def test_exit_codes_of_the_command(what, tmp_path):
     options, code, message = CODES[what]
-    result = CliRunner().invoke(app, ["identify", PUMP, *options])
+    page = tmp_path / "page.html"
+    result = CliRunner().invoke(app, ["identify", PUMP, *options, "--page", str(page)])
     assert (result.exit_code, message in result.output) == (code, True), result.output
+    assert page.exists() == (code == 3)
+    assert code == 2 or message in page.read_text(encoding="utf-8")
 
 
 def test_a_negative_effect_neither_rises_nor_falls():

@@ -46,12 +46,14 @@ from driftfit.identify.page import Identification, ManyIdentified, interval
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
-from driftfit.parsing.settings import arx_text, given_fields
+from driftfit.models.arx import arx_text
+from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.run.live.conformal import quantile
 from driftfit.show.export import check_ending, write, write_table
-from driftfit.show.report import check_path
+from driftfit.show.page import document, opening
+from driftfit.show.report import check_path, written
 from driftfit.show.text import digits, facts, shortened, table_of
 from driftfit.tune.tune import tune as estimate
 from driftfit.tune.tuned import Tuned
@@ -411,7 +413,8 @@ def identify_command(
             )  # fmt: skip
         except NoAnswerError as error:
             status.stop()
-            typer.echo(f"driftfit: this record cannot answer: {error}", err=True)
+            typer.echo(text := f"driftfit: this record cannot answer: {error}", err=True)
+            written(document("No answer", [opening([text])]), page)
             raise typer.Exit(3) from None
     write_answer(found, page, json_to, quiet)
     raise typer.Exit(found.code)

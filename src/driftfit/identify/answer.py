@@ -22,10 +22,10 @@ from driftfit.identify.judgement import effects, errors_of, feedback, moves
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
-from driftfit.identify.structure import Structure, search
+from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
-from driftfit.judge.verdict import Verdict, judged
+from driftfit.judge.verdict import Verdict, judged, p_equals
 from driftfit.models.arx import ARX
 from driftfit.results import Track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -98,7 +98,7 @@ def identify(
     if found.by is None:
         return task.judged(found, structure)
     progress("tracking")
-    model = model_of(found, structure)
+    model = model_of(found, structure.shape)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
     verdicts, worst = fleet.verdict(level), {}
     for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
@@ -120,13 +120,13 @@ def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles,
     """Roles and structure alone, with the defaults of `identify`."""
     found = roles(data, y, time=time, wanted=reading)
     check_record(found)
-    return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False))
+    return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False).shape)
 
 
-def model_of(found: Roles, structure: Structure) -> ARX:
+def model_of(found: Roles, shape: Shape) -> ARX:
     """The ARX model of a structure."""
-    inputs, nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in range(3))
-    return ARX(structure.na, nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
+    inputs, nb, nk = (tuple(one[i] for one in shape[1]) for i in range(3))
+    return ARX(shape[0], nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
 
 
 @dataclass(frozen=True)
@@ -154,19 +154,24 @@ class _Task:
             best = replace(best, forecast=search(y, U, max_lag, 1, end, rng))
         return best
 
+    def tracked(self, found: Roles, shape: Shape) -> tuple[Track, Evidence]:
+        """The run of a structure, and what it says of the record."""
+        model = model_of(found, shape)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        return run, Evidence(run, level=self.level)
+
     def judged(self, found: Roles, structure: Structure) -> Identification:
         """The answer for one record, or its last part if time is short."""
-        model, T = model_of(found, structure), len(found.y)
+        model, T = model_of(found, structure.shape), len(found.y)
         most = max(LEAST, int(RATE * (self.end - monotonic()) / model.n))
         if most < T:
             short = f"only the last {most} of {T} samples were judged (--budget)"
             structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
-            found = found.rows(np.arange(T - most, T))
+            found = found.last(most)
             check_record(found)
         y, U, place = found.spread(structure.na + 40)
         self.progress("tracking")
-        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
-        known = Evidence(run, level=self.level)
+        run, known = self.tracked(found, structure.shape)
         self.progress("time or working point")
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
@@ -178,9 +183,12 @@ class _Task:
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
             again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
             besides = again is None or again.rejected
+        second = self.tracked(found, structure.second[0][0])[1].p if besides and structure.second else 0.0
         theta, memory, own = effects(known)
         moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
-        why, share = verdict.untested, 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
+        other = f"with the chosen structure ({p_equals(verdict.p)}), but not with the second ({p_equals(second)})"
+        why = f"constants are rejected {other}" if second >= self.level else verdict.untested
+        share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
         if share > 100.0 * LEFT_OUT and self.gate is None:
             codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
             why = f"{codes}; if they are, say so with --gate, and if not, with --no-gate"

@@ -24,7 +24,7 @@ from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
 from driftfit.judge.structures.candidates import weigh
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
-from driftfit.use.simulate import moved
+from driftfit.use.simulate import moved, steps_ahead
 
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
@@ -40,8 +40,8 @@ class Errors(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, where there may
-    be a unit root; without inputs the level. Its standard error; the change half-way found in 4 of 5 records.
+    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, with a unit
+    root; without inputs the level. Its standard error; the change half-way that is found in 4 of 5 records.
     """
 
     name: str
@@ -89,24 +89,12 @@ def weights(first: Array, second: Array) -> Array:
     return weight[:, 0]
 
 
-def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
-    """Predictions (T,) h steps ahead, from theta (T, n) known before each sample and phi (T, n): na lags of the output,
-    and regressors that are given."""
-    made: list[Array] = []
-    for s in range(h):
-        now = moved(phi, -s)
-        for i in range(min(s, na)):
-            now[:, i] = made[s - 1 - i]
-        made.append(np.einsum("tn,tn->t", theta, now))
-    return moved(made[-1], h - 1)
-
-
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
     run, own, steady, found = known.run, known.errors, known.steady, []
     y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
     paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
-    far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
+    far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
     cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
     if horizon > 1:

@@ -26,10 +26,9 @@ from driftfit.identify.working_point import Cause
 from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, p_equals
-from driftfit.models.arx import ARX
+from driftfit.models.arx import ARX, arx_text
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.parsing.settings import arx_text
 from driftfit.results import Track
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, opening, picture, points, section, table
@@ -138,7 +137,8 @@ def chosen(answer: Identification) -> list[str]:
     other = found.forecast and structure_text(answer, found.forecast.shape)
     lags = f"; sum of the lags of {output} {memory.value:.3f} +- {memory.std:.2g}{root}" if found.na else ""
     logged = f"the same of the logarithm of {output}, {found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead"
-    said = [f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind." for shape, b, e in found.second]
+    said = [f"Second: {structure_text(answer, shape)}, {abs(b):.1f} +- {e:.1f} nats {'behind' if b >= 0 else 'ahead'}."
+            for shape, b, e in found.second]  # fmt: skip
     told = (
         f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.", *said[:1],
         found.log[0] > TIED and f"Better: {logged}, on the scale of {output}.",
@@ -153,9 +153,8 @@ def columns(roles: Roles) -> list[str]:
     inputs = f"inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u)"
     clock = f"{roles.clock}, every {interval(roles)} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
     by = f"; records by {roles.by} (--by)" if roles.by else ""
-    said = [f"Output {roles.output} (--y); {inputs}; time {clock}{by}."]
     left = ", ".join(f"{name} ({why})" for name, why in roles.why.items())
-    return [*said, f"Not inputs: {left}."] if left else said
+    return [f"Output {roles.output} (--y); {inputs}; time {clock}{by}.", *([f"Not inputs: {left}."] if left else [])]
 
 
 def commands(answer: Identification) -> list[str]:

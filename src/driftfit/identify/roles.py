@@ -67,6 +67,12 @@ class Roles:
         time = None if self.time is None else self.time[at]
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at))
 
+    def last(self, count: int) -> Roles:
+        """The last rows; without a clock their numbers are the time."""
+        at = np.arange(len(self.y) - count, len(self.y))
+        kept = self.rows(at)
+        return kept if self.time is not None else replace(kept, time=at.astype(float), dt=1.0)
+
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
         parts = [np.flatnonzero(self.groups == k) for k in range(self.groups.max() + 1)]
@@ -77,12 +83,13 @@ class Roles:
         """The arguments of `track` for some inputs."""
         columns: dict[str, Any] = {self.output: self.y, **dict(zip(self.inputs, self.U.T, strict=True))}
         table = pl.DataFrame(columns | ({} if self.by is None else {self.by: self.key}))
-        if self.clock is not None:
-            time = pl.Series(self.clock, self.time)
+        clock = None if self.time is None else self.clock or "number of the row"
+        if clock is not None:
+            time = pl.Series(clock, self.time)
             time = time.dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone) if self.zone else time
             table = table.with_columns(time)
         units = {name: unit for name, unit in self.units.items() if name in (*inputs, self.output)} or None
-        given = {"y": self.output, "u": list(inputs) or None, "data": table, "time": self.clock}
+        given = {"y": self.output, "u": list(inputs) or None, "data": table, "time": clock}
         return given | {"dt": self.dt, "units": units}
 
     def spread(self, longest: int) -> tuple[Array, Array, Array]:

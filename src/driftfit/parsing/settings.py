@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 from driftfit import models, trackers
 from driftfit.engine.settings import Settings, near
-from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.parsing import expressions
 from driftfit.trackers.base import Tracker
@@ -65,12 +64,6 @@ def parse_model(text: str) -> Model:
             key, value = places[position], key
         add_setting(f"model {text}", settings, known, key, parse_value(value, "/") if value else True)
     return build(f"model {text}", kind, settings)
-
-
-def arx_text(model: ARX) -> str:
-    """The text of an ARX model with an intercept: the inverse of `parse_model`."""
-    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
-    return f"arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
 
 
 def own_tracker(place: str) -> type[Tracker]:
