@@ -193,9 +193,9 @@ def ours(plant: Plant) -> Found:
         again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
         moves = again is None or again.rejected
     kind, agreed = why.kind(moves), True
-    if moves and best.second:  # the structure that came second must say so, too
-        (na, used), *_ = best.second[0]
-        agreed = Judged.of(plant, Structure(na, {j: (nb, nk) for j, nb, nk in used})).changes.rejected
+    if moves:  # the structures that came next must say so, too
+        nexts = (Structure(na, {j: (nb, nk) for j, nb, nk in used}) for (na, used), *_ in best.second)
+        agreed = all(Judged.of(plant, one).changes.rejected for one in nexts)
     inputs = {record.inputs[j]: ends for j, ends in best.delays.items()}
     moves = one.changes.rejected and kind != "working point" and agreed
     return one.found._replace(inputs=inputs, moves=moves, cause=kind if moves or kind == "working point" else "")

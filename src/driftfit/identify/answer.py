@@ -1,9 +1,9 @@
 """identify: from a table to an answer. What moves, since when, by how much, and is it time or the working point?
 
 The steps are `driftfit.identify.roles`, `structure`, `working_point` and `judgement`; each has its equations. The
-structure is chosen from the whole record, so p-values are those of a test after a selection; errors are always those of
-predictions made before the sample. Cost: for T rows and p columns of lags, O(T p^2) for the search, and that of
-`Track.verdict`.
+structure is chosen from the whole record, so p-values are those of a test after a selection: parameters move only if
+those that came next say so, too. Errors are always those of predictions made before the sample. Cost: for T rows and p
+columns of lags, O(T p^2) for the search, and that of up to four verdicts.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def identify(
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
-    codes = gate is not False
-    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=codes, wanted=reading)
+    found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
+                  wanted=reading)  # fmt: skip
     check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
@@ -183,20 +183,21 @@ class _Task:
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
             again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
             besides = again is None or again.rejected
-        second = self.tracked(found, structure.second[0][0])[1].p if besides and structure.second else 0.0
+        others = (self.tracked(found, shape)[1].p for shape, *_ in structure.second if besides)
+        least = next((p for p in others if p >= self.level), 0.0)
         theta, memory, own = effects(known)
         moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
-        other = f"with the chosen structure ({p_equals(verdict.p)}), but not with the second ({p_equals(second)})"
-        why = f"constants are rejected {other}" if second >= self.level else verdict.untested
+        other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
+        why = f"constants are rejected {other}" if least else verdict.untested
         share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
         if share > 100.0 * LEFT_OUT and self.gate is None:
-            codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
-            why = f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
+            why = f"{share:.1f} % of the readings look like fault codes or spikes and were left out; "
+            why += "if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
-        said = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
         return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
-                              *said, self.source)  # fmt: skip
+                              _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict),
+                              self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:

@@ -174,11 +174,10 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    roles = answer.roles
-    own = {"name": PurePath(answer.source).stem, "y": roles.output, "u": answer.model.input_names}
-    own |= {"dt": roles.dt} if isinstance(roles.dt, str) else {}
-    own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
-    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
+    own = {"name": PurePath(answer.source).stem, "y": answer.roles.output, "u": answer.model.input_names}
+    own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
+    each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
+    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
     return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
 
 

@@ -29,8 +29,6 @@ SLOW = 20
 CLEAR = 3.0
 """Nats by which one description must lead another: -log of a level of 5 %."""
 
-Lead = tuple[float, float]
-
 
 @dataclass(frozen=True)
 class Cause:
@@ -41,9 +39,9 @@ class Cause:
     static curve, or -1.
     """
 
-    tracked: Lead
-    curve: Lead
-    joint: Lead
+    tracked: tuple[float, float]
+    curve: tuple[float, float]
+    joint: tuple[float, float]
     products: tuple[str, ...]
     bent: int
     columns: Array
