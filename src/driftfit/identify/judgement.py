@@ -132,10 +132,11 @@ def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
     memory, found = Memory(float(lags @ theta), float(np.sqrt(lags @ cov @ lags))), []
     rest = 1.0 if memory.root else 1.0 - memory.value
     for name in known.run.model.input_names or ("level",):
-        gain, least = float(own[name] @ theta) / rest, FOUND * float(np.sqrt(own[name] @ cov @ own[name])) / abs(rest)
+        gain = float(own[name] @ theta) / rest
         slope = own[name] / rest + (0.0 if memory.root else gain / rest * lags)
-        name = known.run.labels.y if name == "level" else name
-        found.append(Effect(name, gain, float(np.sqrt(slope @ cov @ slope)), least))
+        std, alone = (float(np.sqrt(one @ cov @ one)) for one in (slope, own[name] / rest))
+        name, least = (known.run.labels.y, std) if name == "level" else (name, alone)  # a level is that of all lags
+        found.append(Effect(name, gain, std, FOUND * least))
     return theta, memory, tuple(found)
 
 

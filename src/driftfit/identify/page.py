@@ -174,7 +174,11 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    own = {"name": PurePath(answer.source).stem, "y": answer.roles.output, "u": answer.model.input_names}
+    own: dict[str, Any] = {
+        "name": PurePath(answer.source).stem,
+        "y": answer.roles.output,
+        "u": answer.model.input_names,
+    }
     own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)

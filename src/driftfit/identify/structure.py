@@ -29,7 +29,6 @@ COLUMN = 1.5
 TIED = 2.0
 """Nats within which delays and inputs are said to be as good."""
 COPIES = 19
-OUTPUT_LAGS = 8
 COLUMNS = 250
 """Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
 FILLED = 3
@@ -76,7 +75,7 @@ def filled(x: Array) -> Array:
 class Pool:
     """All columns of a record on a regular grid: 1, na lags of y (T,), lags first..M of every column of U (T, m)."""
 
-    def __init__(self, y: Array, U: Array, M: int, first: int = 0, na: int = OUTPUT_LAGS, more: Array | None = None):
+    def __init__(self, y: Array, U: Array, M: int, first: int = 0, na: int = 8, more: Array | None = None):
         past, U = filled(y), np.column_stack([filled(u) for u in U.T]) if U.shape[1] else U
         self.m, self.M, self.na = U.shape[1], M, na
         self.place: dict[tuple[int, int], int] = {}
