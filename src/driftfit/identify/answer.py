@@ -168,14 +168,12 @@ class _Task:
             short = f"only the last {most} of {T} samples were judged (--budget)"
             structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
             found = found.last(most)
-            check_record(found)
         y, U, place = found.spread(structure.na + 40)
         self.progress("tracking")
         run, known = self.tracked(found, structure.shape)
         self.progress("time or working point")
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
-        self.progress("judging")
         verdict = judged(known)
         besides = bool(verdict.drifts)
         if besides and why_not.products:

@@ -5,17 +5,18 @@ With p_1 and p_2 the densities of a reading under the tracker and under recursiv
     w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
 so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs, and are weighed
-by what is known h steps before.
+predictions are made before the sample; those h steps ahead are given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.structure import Pool
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
@@ -172,6 +173,8 @@ def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move,
 
 def feedback(y: Array, u: Array) -> bool:
     """Whether y (T,) acts on an input u (T,): three lags of y beside three of u are worth their price."""
-    pool = Pool(u, y[:, None], 3, 1, 3)
-    pool.scores.refer(pool.columns((3, ())))
-    return pool.value((3, ((0, 3, 1),))) > pool.value((3, ()))
+    with suppress(NoAnswerError):  # too few rows to tell
+        pool = Pool(u, y[:, None], 3, 1, 3)
+        pool.scores.refer(pool.columns((3, ())))
+        return pool.value((3, ((0, 3, 1),))) > pool.value((3, ()))
+    return False

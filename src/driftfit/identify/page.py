@@ -174,11 +174,7 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    own: dict[str, Any] = {
-        "name": PurePath(answer.source).stem,
-        "y": answer.roles.output,
-        "u": answer.model.input_names,
-    }
+    own = dict[str, Any](name=PurePath(answer.source).stem, y=answer.roles.output, u=answer.model.input_names)
     own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
@@ -195,8 +191,8 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
-    rest = {"Data": answer.notes, "Not decided": answer.undecided}
-    said = [f"{head}: {'; '.join(each)}." for head, each in rest.items() if each]
+    said = [f"{head}: {'; '.join(each)}." for head, each in
+            (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
     short = [line if len(line) < WIDTH else line.replace(" --model", " \\\n   --model") for line in commands(answer)]
     return [
@@ -220,10 +216,10 @@ def as_json(answer: Identification) -> dict[str, Any]:
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
-    shown = ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
-        "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
+        "model": repr(answer.model), "p": answer.verdict.p, "roles": {
+            name: getattr(roles, name) for name in ["output", "inputs", "clock", "by", "dt", "why", "refused", "missing"]},
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
         "commands": commands(answer), "unit": unit(answer),

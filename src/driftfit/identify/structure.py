@@ -65,8 +65,7 @@ class Structure:
 
 
 def filled(x: Array) -> Array:
-    """A signal (T,) with at most `FILLED` missing readings in a row replaced by the last one, but not across gaps in
-    time, which are inf; NaN for what stays missing."""
+    """A signal (T,) whose last reading replaces up to `FILLED` missing ones, not across gaps in time, which are inf."""
     t, known = np.arange(len(x)), ~np.isnan(x)
     last = np.maximum.accumulate(np.where(known, t, 0))
     return np.where((t - last <= FILLED) & np.isfinite(x[last]), x[last], np.nan)
