@@ -32,7 +32,7 @@ from scipy import signal
 
 from driftfit.engine.kernel import Array
 from driftfit.identify.roles import roles
-from driftfit.identify.structure import Structure, lagged, search
+from driftfit.identify.structure import Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.changes.changes import Changes
 from driftfit.judge.changes.null import Lags
@@ -41,6 +41,7 @@ from driftfit.judge.evidence import REJECTED as LEVEL
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.coarse_readings import step_of
+from driftfit.use.simulate import moved
 
 T = 1500
 BEFORE = 200
@@ -154,9 +155,9 @@ class Judged(NamedTuple):
     def of(cls, plant: Plant, structure: Structure) -> Judged:
         """The verdict of a structure, whose inputs are numbered in the order of the table."""
         y, names = plant.table["flow"], [name for name in plant.table if name != "flow"]
-        past = [lagged(y, k + 1) for k in range(structure.na)]
+        past = [moved(y, k + 1) for k in range(structure.na)]
         each = [(names[j], k) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-        phi = np.column_stack([*past, *(lagged(plant.table[name], k) for name, k in each), np.ones(T)])
+        phi = np.column_stack([*past, *(moved(plant.table[name], k) for name, k in each), np.ones(T)])
         at = np.flatnonzero(np.isfinite(phi).all(axis=1))
         source = (
             np.column_stack([at - at[0] - k - 1 for k in range(structure.na)]) if past else np.zeros((len(at), 0), int)
@@ -191,9 +192,12 @@ def ours(plant: Plant) -> Found:
         more = one.rows._replace(phi=np.hstack([one.rows.phi, why.columns]), lags=None)
         again = judged_rows(more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1])), LEVEL)
         moves = again is None or again.rejected
-    kind = why.kind(moves)
+    kind, agreed = why.kind(moves), True
+    if moves:  # the structures that came next must say so, too
+        nexts = (Structure(na, {j: (nb, nk) for j, nb, nk in used}) for (na, used), *_ in best.second)
+        agreed = all(Judged.of(plant, one).changes.rejected for one in nexts)
     inputs = {record.inputs[j]: ends for j, ends in best.delays.items()}
-    moves = one.changes.rejected and kind != "working point"
+    moves = one.changes.rejected and kind != "working point" and agreed
     return one.found._replace(inputs=inputs, moves=moves, cause=kind if moves or kind == "working point" else "")
 
 

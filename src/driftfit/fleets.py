@@ -14,7 +14,7 @@ from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.results import Exported, Track
 from driftfit.run import fleet, result
 from driftfit.show.plots import plot_fleet, plot_outputs
-from driftfit.show.report import check_path, page_of_many
+from driftfit.show.report import page_of_many, written
 from driftfit.show.summary import FleetSummary, Summary, summarise_fleet, summarise_outputs
 from driftfit.show.text import ByOutput
 from driftfit.smooth.smoothed import Smoothed
@@ -77,7 +77,7 @@ class Judged(fleet.KeyedResults, Exported):
         parameter, when, from what to what. ValueError if it is no time of these records.
         """
         text = page_of_many(self._rows(), self.by, title, self.failed, self.dropped, alarms, labels, since)
-        check_path(path).write_text(text, encoding="utf-8")
+        written(text, path)
 
     def crossing(
         self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,

@@ -41,17 +41,19 @@ from driftfit.data.tables import read_records
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
-from driftfit.identify.answer import Identification, ManyIdentified, chosen, identify
-from driftfit.identify.page import interval, short
+from driftfit.identify.answer import chosen, identify
+from driftfit.identify.page import Identification, ManyIdentified, interval
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
+from driftfit.models.arx import arx_text
 from driftfit.parsing.settings import given_fields
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.run.live.conformal import quantile
 from driftfit.show.export import check_ending, write, write_table
-from driftfit.show.report import check_path
+from driftfit.show.page import document, opening
+from driftfit.show.report import check_path, written
 from driftfit.show.text import digits, facts, shortened, table_of
 from driftfit.tune.tune import tune as estimate
 from driftfit.tune.tuned import Tuned
@@ -104,7 +106,7 @@ def _with_structure(given: Given) -> Given:
     """The options with the inputs, the structure and the time that `driftfit identify` finds."""
     with progress.status("searching the structure"):
         found, model = chosen(given.file[0], given.outputs[0], given.time, given.wanted)
-    text, inputs = short(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
+    text, inputs = arx_text(model), f" --u {','.join(model.input_names)}" if model.input_names else ""
     say(Text(f" Chosen: --model {text}{inputs}; `driftfit identify` says why."), soft_wrap=True)
     dt = given.dt or (interval(found) if found.clock else None)
     return replace(given, model=[text], u=list(model.input_names), time=found.clock, dt=dt)
@@ -411,7 +413,8 @@ def identify_command(
             )  # fmt: skip
         except NoAnswerError as error:
             status.stop()
-            typer.echo(f"driftfit: this record cannot answer: {error}", err=True)
+            typer.echo(text := f"driftfit: this record cannot answer: {error}", err=True)
+            written(document("No answer", [opening([text])]), page)
             raise typer.Exit(3) from None
     write_answer(found, page, json_to, quiet)
     raise typer.Exit(found.code)

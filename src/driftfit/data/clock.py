@@ -106,6 +106,13 @@ class Clock:
         text = name if self.count == 1.0 else f"{self.count:g} {name}s"
         return f"{text} except {', '.join(self.holidays)}" if self.holidays else text
 
+    def lasting(self, count: int) -> str:
+        """So many intervals in words, such as "70 s", "2 months" or, without a unit, "3 samples"."""
+        if self.duration is not None:
+            return re.sub(r"(?<=\d)(?=\D)", " ", duration_text(count * self.duration))
+        number, kind = (count, "sample") if self.kind == "number" else (int(count * self.count), self.kind)
+        return f"{number} {kind}{'' if number == 1 else 's'}"
+
     def between(self, last: Array, time: Array) -> Array:
         """Nominal intervals from times ``last`` to ``time``, elementwise."""
         self._fits(time)

@@ -1,119 +1,42 @@
 """identify: from a table to an answer. What moves, since when, by how much, and is it time or the working point?
 
 The steps are `driftfit.identify.roles`, `structure`, `working_point` and `judgement`; each has its equations. The
-structure is chosen from the whole record, so p-values are those of a test after a selection; errors are always those of
-predictions made before the sample. Cost: for T rows and p columns of lags, O(T p^2) for the search, and that of
-`Track.verdict`.
+structure is chosen from the whole record, so p-values are those of a test after a selection: parameters move only if
+those that came next say so, too. Errors are always those of predictions made before the sample. Cost: for T rows and p
+columns of lags, O(T p^2) for the search, and that of up to four verdicts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.text import Text
 
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.fleets import Fleet
-from driftfit.identify import page
 from driftfit.identify.judgement import effects, errors_of, feedback, moves
-from driftfit.identify.result import Answer
+from driftfit.identify.page import KINDS, Identification, ManyIdentified
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
-from driftfit.identify.structure import Structure, search
+from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
-from driftfit.judge.evidence import Evidence, judged_rows
-from driftfit.judge.fleet_verdict import ManyVerdicts
-from driftfit.judge.verdict import Verdict, judged
+from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
+from driftfit.judge.verdict import Verdict, judged, p_equals
 from driftfit.models.arx import ARX
 from driftfit.results import Track
-from driftfit.show.report import check_path
-from driftfit.show.text import Printed
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.tracking import track
 
 LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
-FEEDBACK = 5.0
-"""F statistic above which the output is said to act on an input."""
 RATE, LEAST = 1000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
 """Records of a fleet that have a page."""
-
-
-@dataclass(frozen=True)
-class Identification(Answer):
-    """The result of `identify`, an `Answer`; printing it shows some 25 lines."""
-
-    @property
-    def headline(self) -> str:
-        """The answer in one sentence or two."""
-        return page.headline(self)
-
-    def json(self) -> dict[str, Any]:
-        """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
-        return page.as_json(self)
-
-    def plot(self) -> Any:
-        """The picture of the page; a matplotlib figure."""
-        return page.figure(self)
-
-    def page(self, path: Any = None) -> str:
-        """The answer as one self-contained HTML page; with a ``path`` it is written there."""
-        return _written(page.html(self), path)
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for style, line in page.lines(self):
-            yield Text(line, style)
-
-
-@dataclass(frozen=True)
-class ManyIdentified(Printed):
-    """The result of `identify` for records with one structure: the fleet, its verdicts, the clearest three by key."""
-
-    model: ARX
-    track: Fleet = field(repr=False)
-    verdict: ManyVerdicts = field(repr=False)
-    worst: Mapping[Any, Identification]
-
-    @property
-    def headline(self) -> str:
-        """The answer in a sentence."""
-        return self.verdict.sentences[0]
-
-    @property
-    def code(self) -> int:
-        """Exit code of the command: 1 if no record could be judged."""
-        return int(all(row.drifts is None for row in self.verdict.rows))
-
-    def json(self) -> dict[str, Any]:
-        """The records by key, and the clearest as for one record."""
-        rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
-        worst = {str(key): one.json() for key, one in self.worst.items()}
-        return {"schema": page.NAME, "headline": self.headline, "records": page.finite(rows), "worst": worst}
-
-    def page(self, path: Any = None) -> str:
-        """One page: the table of all records, then the three that move most clearly."""
-        return _written(page.many(self.verdict, self.worst), path)
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
-        yield self.verdict
-        for key, one in self.worst.items():
-            yield Text(f"\n {key}: {one.headline}")
-
-
-def _written(text: str, path: Any) -> str:
-    if path is not None:
-        check_path(path).write_text(text, encoding="utf-8")
-    return text
 
 
 def identify(
@@ -123,7 +46,7 @@ def identify(
     horizon: int = 10, level: float = 0.05, gate: bool | None = None, budget: float = 45.0, seed: int = 0,
     reading: Wanted | None = None, progress: Callable[[str], None] = lambda text: None,
 ) -> Identification | ManyIdentified:  # fmt: skip
-    """From a table to an answer: roles, structure, drift and its cause.
+    """From a table to an answer: roles, structure, drift and its cause; `ManyIdentified` for several records.
 
     Parameters
     ----------
@@ -138,43 +61,31 @@ def identify(
         Nominal interval, as for `track`; the median by default.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
-    max_lag : int
-        Longest lag of an input.
+    max_lag, horizon : int
+        Longest lag of an input; steps ahead of the second comparison of errors.
     forecast : bool
-        Only inputs of earlier samples (nk of at least 1). By default an input of the same sample may explain y, and
-        the forecast is said beside it.
-    horizon : int
-        Steps ahead of the second comparison of errors.
+        Only inputs of earlier samples. By default one of the same sample may explain y; a forecast is said beside it.
     level : number
         Error rate of the statement that parameters move.
     gate : bool or None
-        As for `track`. None: the gate of the default tracker, but there is no answer where it, or `roles`, leaves out
-        more than `LEFT_OUT` of the readings.
+        As for `track`. None: that of the default tracker, and no answer if more than `LEFT_OUT` of the readings go.
     budget : number
-        Seconds for one record. The search stops after a third of them, and then the last samples are judged of which
-        the verdict is expected to take no more than what is left. For several records it is that of the search.
-    seed : int
-        That of the displaced copies of inputs.
+        Seconds for one record. The search stops after a third of them; then as many of the last samples are judged as
+        are expected to take what is left. For several records it is that of the search.
+    seed, progress : int, callable
+        Seed of the displaced copies of inputs; told what is being done.
     reading : Wanted or None
         How a CSV file is read: decimal sign, separator, form of dates, words for missing values.
-    progress : callable
-        Told what is being done.
-
-    Returns
-    -------
-    Identification, or ManyIdentified for a table with several records.
 
     Raises
     ------
     ValueError
-        For columns that do not exist, an output that is not named and not obvious, and everything that `track` does
-        not accept.
+        For columns that do not exist, an output that is not named and not obvious, and what `track` does not accept.
     driftfit.identify.roles.NoAnswerError
         For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
-    for name, value in (("max_lag", max_lag), ("horizon", horizon)):
-        whole("identify", name, value, 1)
+    max_lag, horizon = whole("identify", "max_lag", max_lag, 1), whole("identify", "horizon", horizon, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
     progress("reading")
@@ -182,17 +93,18 @@ def identify(
                   wanted=reading)  # fmt: skip
     check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
-    task = _Task(int(forecast), horizon, level, gate, end, seed, progress, source)
+    task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
     if found.by is None:
         return task.judged(found, structure)
     progress("tracking")
-    model = model_of(found, structure)
+    model = model_of(found, structure.shape)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
     verdicts, worst = fleet.verdict(level), {}
-    for row in (one for one in verdicts.rows[:WORST] if one.drifts is not None):
-        worst[row.key] = task.judged(found.record(row.key), structure)
-    return ManyIdentified(model, fleet, verdicts, worst)
+    for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
+        at = np.flatnonzero([one == key for one in found.key])
+        worst[key] = task.judged(replace(found.rows(at), by=None), structure)
+    return ManyIdentified(model, fleet, verdicts, worst, found)
 
 
 def check_record(found: Roles) -> None:
@@ -208,33 +120,32 @@ def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles,
     """Roles and structure alone, with the defaults of `identify`."""
     found = roles(data, y, time=time, wanted=reading)
     check_record(found)
-    task = _Task(0, 1, 0.05, None, monotonic() + 45.0, 0, lambda text: None, "")
-    return found, model_of(found, task.structure(found, 30, forecast=False))
+    return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False).shape)
 
 
-def model_of(found: Roles, structure: Structure) -> ARX:
+def model_of(found: Roles, shape: Shape) -> ARX:
     """The ARX model of a structure."""
-    inputs, nb, nk = (tuple(one[i] for one in structure.shape[1]) for i in range(3))
-    return ARX(structure.na, nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
+    inputs, nb, nk = (tuple(one[i] for one in shape[1]) for i in range(3))
+    return ARX(shape[0], nb or 0, nk or 1, inputs=tuple(found.inputs[j] for j in inputs) or None, intercept=True)
 
 
 @dataclass(frozen=True)
 class _Task:
     """The settings of a call."""
 
-    first: int
-    horizon: int
-    level: float
-    gate: bool | None
     end: float
-    seed: int
-    progress: Callable[[str], None]
-    source: str
+    first: int = 0
+    horizon: int = 1
+    level: float = REJECTED
+    gate: bool | None = None
+    seed: int = 0
+    progress: Callable[[str], None] = lambda text: None
+    source: str = ""
 
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
         self.progress("searching the structure")
-        y, U, _ = found.centred().spread(max_lag + 1)
+        y, U, _ = (found.centred() if found.by else found).spread(max_lag + 1)  # levels of records may differ
         rng, now = np.random.default_rng(self.seed), monotonic()
         end = now + (self.end - now) / 3.0
         best = search(y, U, max_lag, self.first, end, rng)
@@ -243,58 +154,59 @@ class _Task:
             best = replace(best, forecast=search(y, U, max_lag, 1, end, rng))
         return best
 
+    def tracked(self, found: Roles, shape: Shape) -> tuple[Track, Evidence]:
+        """The run of a structure, and what it says of the record."""
+        model = model_of(found, shape)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        return run, Evidence(run, level=self.level)
+
     def judged(self, found: Roles, structure: Structure) -> Identification:
         """The answer for one record, or its last part if time is short."""
-        model, T = model_of(found, structure), len(found.y)
+        model, T = model_of(found, structure.shape), len(found.y)
         most = max(LEAST, int(RATE * (self.end - monotonic()) / model.n))
         if most < T:
             short = f"only the last {most} of {T} samples were judged (--budget)"
             structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
-            found = found.rows(np.arange(T - most, T))
-            check_record(found)
+            found = found.last(most)
         y, U, place = found.spread(structure.na + 40)
         self.progress("tracking")
-        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
-        known = Evidence(run, level=self.level)
+        run, known = self.tracked(found, structure.shape)
         self.progress("time or working point")
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
-        self.progress("judging")
         verdict = judged(known)
-        moves_besides = bool(verdict.drifts)
-        if moves_besides and why_not.products:
+        besides = bool(verdict.drifts)
+        if besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
-            besides = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
-            moves_besides = besides is None or besides.rejected
+            again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
+            besides = again is None or again.rejected
+        others = (self.tracked(found, shape)[1].p for shape, *_ in structure.second if besides)
+        least = next((p for p in others if p >= self.level), 0.0)
         theta, memory, own = effects(known)
-        notes, undecided = _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict)
-        kind, why = self._kind(found, run, verdict, why_not.kind(moves_besides))
-        return Identification(
-            kind, why, model, run, verdict, found, structure, why_not, own, moves(verdict, run, theta, memory.root),
-            memory, errors_of(known, self.horizon), notes, undecided, self.source,
-        )  # fmt: skip
-
-    def _kind(self, found: Roles, run: Track, verdict: Verdict, kind: str) -> tuple[str, str]:
-        """The answer in a word, and why there is none."""
+        moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
+        other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
+        why = f"constants are rejected {other}" if least else verdict.untested
         share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
         if share > 100.0 * LEFT_OUT and self.gate is None:
-            codes = f"{share:.1f} % of the readings look like fault codes or spikes and were left out"
-            return page.KINDS[4], f"{codes}; if they are, say so with --gate, and if not, with --no-gate"
-        if verdict.drifts is None:
-            return page.KINDS[4], verdict.untested
-        moving = {"working point": 1, "both": 2}.get(kind, 0)
-        return page.KINDS[moving if verdict.drifts or moving == 1 else 3], ""
+            why = f"{share:.1f} % of the readings look like fault codes or spikes and were left out; "
+            why += "if they are, say so with --gate, and if not, with --no-gate"
+        moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
+        kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
+                              _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict),
+                              self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
     """Problems of the data, each in a few words."""
-    fed = [j for j in structure.lags if feedback(y, U[:, j]) > FEEDBACK]
+    fed = [j for j in structure.lags if feedback(y, U[:, j])]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
     notes = (
-        *(f"{count} readings of {name} taken as codes or spikes" for name, count in found.refused.items()),
+        "" if found.inputs else f"no input moves, so only its own past can explain {found.output}",
+        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
         *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
-        f"{found.missing} readings missing" if found.missing else "",
+        f"missing readings: {found.missing}" if found.missing else "",
         f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
         *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
         structure.narrowed,
@@ -304,10 +216,10 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:
     """What the record does not decide, each in a few words."""
-    ranges = [(names[j], *ends) for j, ends in structure.delays.items() if ends[0] < ends[1]]
     return (
-        *(f"the delay of {name}: {low} to {high} samples are as good" for name, low, high in ranges),
+        *(f"the delay of {names[j]}: {low} to {high} samples are as good"
+          for j, (low, high) in structure.delays.items() if low < high),
         *(f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead),
         *(f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful),
         *(["a level that wanders, or noise that does"] if verdict.nearly_walk else []),
-    )
+    )  # fmt: skip

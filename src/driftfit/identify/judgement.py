@@ -5,30 +5,75 @@ With p_1 and p_2 the densities of a reading under the tracker and under recursiv
     w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
 so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample, one step or h steps ahead; those h ahead are given the inputs, and are weighed
-by what is known h steps before.
+predictions are made before the sample; those h steps ahead are given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
+from typing import NamedTuple
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.identify.result import Effect, Errors, Memory, Move
-from driftfit.identify.scores import FEWEST
-from driftfit.identify.structure import filled, lagged
+from driftfit.identify.roles import NoAnswerError
+from driftfit.identify.structure import Pool
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
 from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
+from driftfit.use.simulate import moved, steps_ahead
 
 SHARE = 0.001
 """Probability that the other of two predictions is the better one from the next sample on."""
 FOUND = 6.7
 """Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
+
+
+class Errors(NamedTuple):
+    """Root mean square errors ``steps`` ahead, by method, on ``samples`` samples."""
+
+    steps: int
+    rms: dict[str, float]
+    samples: int
+
+
+class Effect(NamedTuple):
+    """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, with a unit
+    root; without inputs the level. Its standard error; the change half-way that is found in 4 of 5 records.
+    """
+
+    name: str
+    gain: float
+    std: float
+    least: float
+
+
+class Memory(NamedTuple):
+    """Sum of the lags of y with its standard error; ``root``: whether 1 is within two of them."""
+
+    value: float
+    std: float
+
+    @property
+    def root(self) -> bool:
+        return self.value + 2.0 * self.std >= 1.0
+
+
+class Move(NamedTuple):
+    """What an event did to one effect: the static gain of an input, the ``memory`` (sum of a) or the ``level``."""
+
+    what: str
+    kind: str
+    before: float
+    after: float
+    first: str
+    last: str
+    at: int
+    instead: tuple[str, ...]
 
 
 def density(e: Array) -> Array:
@@ -58,29 +103,16 @@ def weights(first: Array, second: Array) -> Array:
     return weight
 
 
-def ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
-    """Predictions (T,) h steps ahead, from theta (T, n) known before each sample and phi (T, n): na lags of the output,
-    and regressors that are given."""
-    made: list[Array] = []
-    for s in range(h):
-        now = np.vstack([phi[s:], np.full((min(s, len(phi)), phi.shape[1]), np.nan)])
-        for i in range(min(s, na)):
-            now[:, i] = made[s - 1 - i]
-        made.append(np.einsum("tn,tn->t", theta, now))
-    return lagged(made[-1], h - 1)
-
-
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
     run, own, steady, found = known.run, known.errors, known.steady, []
     y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
-    none = np.full((1, run.model.n), np.nan)
-    paths = (np.vstack([none, path[:-1]]) for path in (run.theta, steady["theta"][..., 0]))
-    far = [y - ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
+    paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
+    far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
     cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
     if horizon > 1:
-        last = {"persistence": y - lagged(persistence(y), horizon - 1)}
+        last = {"persistence": y - moved(persistence(y), horizon - 1)}
         cases.append((horizon, far[0], far[1], density(far[0]), last))
     for h, tracked, constants, likely, others in cases:
         w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
@@ -113,10 +145,12 @@ def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
     cov = inverse @ inverse.T * s2
     memory, found = Memory(float(lags @ theta), float(np.sqrt(lags @ cov @ lags))), []
     rest = 1.0 if memory.root else 1.0 - memory.value
-    for name in known.run.model.input_names:
-        gain, least = float(own[name] @ theta) / rest, FOUND * float(np.sqrt(own[name] @ cov @ own[name])) / abs(rest)
+    for name in known.run.model.input_names or ("level",):
+        gain = float(own[name] @ theta) / rest
         slope = own[name] / rest + (0.0 if memory.root else gain / rest * lags)
-        found.append(Effect(name, gain, float(np.sqrt(slope @ cov @ slope)), least))
+        std, alone = (float(np.sqrt(one @ cov @ one)) for one in (slope, own[name] / rest))
+        name, least = (known.run.labels.y, std) if name == "level" else (name, alone)  # a level is that of all lags
+        found.append(Effect(name, gain, std, FOUND * least))
     return theta, memory, tuple(found)
 
 
@@ -150,12 +184,10 @@ def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move,
     return tuple(found)
 
 
-def feedback(y: Array, u: Array) -> float:
-    """F statistic of three lags of y in a regression of u on three lags of itself and of y: over 5 is feedback."""
-    X = np.column_stack([np.ones(len(y)), *(lagged(filled(x), k) for x in (u, y) for k in (1, 2, 3))])
-    rows = np.isfinite(X).all(axis=1) & np.isfinite(u)
-    X, z = X[rows], u[rows]
-    if len(z) < FEWEST or np.ptp(z) == 0.0:
-        return 0.0
-    full, less = (float(np.sum((z - A @ (pseudo_inverse(A) @ z)) ** 2)) for A in (X, X[:, :4]))
-    return (less - full) / 3.0 / max(full / (len(z) - 7), SMALL)
+def feedback(y: Array, u: Array) -> bool:
+    """Whether y (T,) acts on an input u (T,): three lags of y beside three of u are worth their price."""
+    with suppress(NoAnswerError):  # too few rows to tell
+        pool = Pool(u, y[:, None], 3, 1, 3)
+        pool.scores.refer(pool.columns((3, ())))
+        return pool.value((3, ((0, 3, 1),))) > pool.value((3, ()))
+    return False

@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
-import re
+import json
+import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from html import escape
+from itertools import groupby
 from pathlib import PurePath
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
-from driftfit.data.clock import Clock, duration_text
-from driftfit.identify.result import Answer, Move
+from driftfit.data.clock import Clock
+from driftfit.fleets import Fleet
+from driftfit.identify.judgement import Effect, Errors, Memory, Move
 from driftfit.identify.roles import Roles
-from driftfit.identify.structure import Shape
+from driftfit.identify.structure import TIED, Shape, Structure
+from driftfit.identify.working_point import Cause
+from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.fleet_verdict import ManyVerdicts
-from driftfit.judge.verdict import p_equals
-from driftfit.models.arx import ARX
+from driftfit.judge.verdict import Verdict, p_equals
+from driftfit.models.arx import ARX, arx_text
+from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.results import Track
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
-from driftfit.show.page import document, facts, opening, picture, points, section, table
-from driftfit.show.text import WIDTH
+from driftfit.show.page import document, opening, picture, points, section, table
+from driftfit.show.report import written
+from driftfit.show.text import WIDTH, Printed
+from driftfit.trackers.rls import RLS
+from driftfit.tracking import track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,10 +50,8 @@ PROPERTIES: dict[str, Any] = {
 }  # fmt: skip
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
-CAPTION = (
-    "Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with its 95 % "
-    "band, from the past only. Red: when it changed."
-)
+CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
+its 95 % band, from the past only. Red: when it changed."""
 
 
 def number(value: float) -> str:
@@ -46,23 +59,17 @@ def number(value: float) -> str:
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
-def duration(answer: Answer, samples: int) -> str:
-    """A number of samples, where the record has dates as a time."""
-    clock = Clock.of(answer.roles.dt) if isinstance(answer.roles.dt, str) else Clock("number")
-    if clock.duration is not None:
-        return re.sub(r"(?<=\d)(?=\D)", " ", duration_text(samples * clock.duration))
-    count = int(samples * clock.count)
-    return f"{count} {'sample' if clock.kind == 'number' else clock.kind}{'' if count == 1 else 's'}"
-
-
-def delay(answer: Answer, name: str) -> str:
+def delay(answer: Identification, name: str) -> str:
     """The delay of an input, a range where several are as good."""
+    if name == answer.roles.output:
+        return "without inputs"
     low, high = answer.structure.delays[answer.roles.inputs.index(name)]
-    first = f"{duration(answer, low)} to " if low < high else ""
-    return f"delay {first}{duration(answer, high)}" if high else "at once"
+    clock = Clock.of(answer.roles.dt or 1.0)
+    first = f"{clock.lasting(low)} to " if low < high else ""
+    return f"delay {first}{clock.lasting(high)}" if high else "at once"
 
 
-def headline(answer: Answer) -> str:
+def conclusion(answer: Identification) -> str:
     """The answer in one sentence or two."""
     output, rms, said = answer.roles.output, answer.errors[0].rms, sentences(answer)
     if answer.kind == "cannot decide":
@@ -71,8 +78,8 @@ def headline(answer: Answer) -> str:
         return f"A static curve explains it, nothing moves in time: {curve(answer)}."
     if answer.kind == "no drift found":
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
-        seen = f" In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
-        return f"No drift found in {output} ({p_equals(answer.verdict.p)}).{seen if least else ''}"
+        seen = f"In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
+        return f"No drift found in {output} ({p_equals(answer.verdict.p)}). {seen}"
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
     more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
@@ -80,19 +87,24 @@ def headline(answer: Answer) -> str:
     return (f"Both: {curve(answer)}. Besides this: " if answer.kind == "both" else "") + text[0].upper() + text[1:]
 
 
-def curve(answer: Answer) -> str:
+def units(answer: Identification, name: str) -> str:
+    """The units of an effect, where both are known."""
+    known = [answer.roles.units.get(one) for one in dict.fromkeys((answer.roles.output, name))]
+    return f" {' per '.join(filter(None, known))}" if all(known) else ""
+
+
+def curve(answer: Identification) -> str:
     """What the curve is made of."""
     nats = f"{answer.cause.curve[0]:.0f} nats over a straight line"
     return f"the effects depend on the working point ({', '.join(answer.cause.products)}; {nats})"
 
 
-def sentences(answer: Answer) -> list[str]:
+def sentences(answer: Identification) -> list[str]:
     """What every event did."""
-    events = dict.fromkeys((move.kind, move.at) for move in answer.moves)
-    return [_event(answer, [move for move in answer.moves if (move.kind, move.at) == one]) for one in events]
+    return [_event(answer, [*own]) for _, own in groupby(answer.moves, lambda move: (move.kind, move.at))]
 
 
-def _event(answer: Answer, own: list[Move]) -> str:
+def _event(answer: Identification, own: list[Move]) -> str:
     one, output = own[0], answer.roles.output
     whats = {"memory": f"the memory of {output} (sum of its lags)", "level": f"the level of {output} (at mean inputs)"}
     whats |= {name: f"the effect of {name} on {output} ({delay(answer, name)})" for name in answer.model.input_names}
@@ -110,54 +122,49 @@ def verb(move: Move) -> str:
     return "wandered" if move.kind == "wandering" else up if move.after > move.before else down
 
 
-def structure_text(answer: Answer, shape: Shape) -> str:
+def structure_text(answer: Identification, shape: Shape) -> str:
     """A structure in short."""
     each = (f", {answer.roles.inputs[j]} {nk}{f' to {nk + nb - 1}' if nb > 1 else ''}" for j, nb, nk in shape[1])
     return f"{shape[0]} lag{'' if shape[0] == 1 else 's'} of {answer.roles.output}{''.join(each)}"
 
 
-def chosen(answer: Answer) -> list[str]:
+def chosen(answer: Identification) -> list[str]:
     """What was chosen, and what came second."""
     found, names, memory, output = answer.structure, answer.roles.inputs, answer.memory, answer.roles.output
     moving, root = {move.what for move in answer.moves}, ": perhaps a unit root" if memory.root else ""
-    idle = [name for j, name in enumerate(names) if j not in found.lags]
-    steady = [names[j] for j in sorted(found.lags) if moving and names[j] not in moving]
+    idle = ", ".join(name for j, name in enumerate(names) if j not in found.lags)
+    steady = ", ".join(names[j] for j in sorted(found.lags) if moving and names[j] not in moving)
     other = found.forecast and structure_text(answer, found.forecast.shape)
-    return [
-        f"Chosen: {structure_text(answer, found.shape)} (lags in samples); sum of the lags of {output} "
-        f"{memory.value:.3f} +- {memory.std:.2g}{root}.",
-        *(
-            f"Second: {structure_text(answer, shape)}, {b:.1f} +- {e:.1f} nats behind."
-            for shape, b, e in found.second[:1]
-        ),
-        *(f"{what}: {', '.join(which)}." for what, which in (("Constant", steady), ("Not needed", idle)) if which),
-        *([f"An input at once explains {output} and does not forecast it. A forecast: {other}."] if other else []),
-    ]
+    lags = f"; sum of the lags of {output} {memory.value:.3f} +- {memory.std:.2g}{root}" if found.na else ""
+    logged = f"the same of the logarithm of {output}, {found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead"
+    said = [f"Second: {structure_text(answer, shape)}, {abs(b):.1f} +- {e:.1f} nats {'behind' if b >= 0 else 'ahead'}."
+            for shape, b, e in found.second]  # fmt: skip
+    told = (
+        f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.", *said[:1],
+        found.log[0] > TIED and f"Better: {logged}, on the scale of {output}.",
+        steady and f"Constant: {steady}.", idle and f"Not needed: {idle}.",
+        other and f"An input at once explains {output} and does not forecast it. A forecast: {other}.",
+    )  # fmt: skip
+    return [one for one in told if one]
 
 
-def columns(answer: Answer) -> list[str]:
+def columns(roles: Roles) -> list[str]:
     """The roles, with the options that change them."""
-    roles = answer.roles
+    inputs = f"inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u)"
     clock = f"{roles.clock}, every {interval(roles)} (--time, --dt)" if roles.clock else "none, rows are even (--time)"
-    said = [f"Output {roles.output} (--y); inputs {', '.join(roles.inputs) or 'none'} (--u, --not-u); time {clock}."]
+    by = f"; records by {roles.by} (--by)" if roles.by else ""
     left = ", ".join(f"{name} ({why})" for name, why in roles.why.items())
-    return [*said, f"Not inputs: {left}."] if left else said
+    return [f"Output {roles.output} (--y); {inputs}; time {clock}{by}.", *([f"Not inputs: {left}."] if left else [])]
 
 
-def commands(answer: Answer) -> list[str]:
+def commands(answer: Identification) -> list[str]:
     """Three lines to copy."""
     model, roles = answer.model, answer.roles
-    inputs = f" --u '{','.join(model.input_names)}'" if model.input_names else ""
-    given = f"{answer.source} --y {roles.output}{inputs} --model {short(model)}"
-    given += f" --time {roles.clock} --dt {interval(roles)}" if roles.clock else ""
-    served = f"driftfit serve {PurePath(answer.source).stem}.toml   # the unit is on the page"
-    return [f"driftfit track {given}", f"driftfit detect {given}", served]
-
-
-def short(model: ARX) -> str:
-    """A model as the option --model."""
-    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
-    return f"arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"
+    each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
+    each |= {"dt": interval(roles)} if roles.clock else {}
+    given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
+    served = f"driftfit serve {shlex.quote(PurePath(answer.source).stem)}.toml   # the unit is on the page"
+    return [*(f"driftfit {verb} {shlex.quote(answer.source)} {given}" for verb in ("track", "detect")), served]
 
 
 def interval(roles: Roles) -> str:
@@ -165,32 +172,37 @@ def interval(roles: Roles) -> str:
     return roles.dt if isinstance(roles.dt, str) else f"{roles.dt:g}"
 
 
-def unit(answer: Answer) -> str:
+def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    names = ", ".join(f'"{name}"' for name in answer.model.input_names)
-    dt = f'dt = "{answer.roles.dt}"\n' if isinstance(answer.roles.dt, str) else ""
-    return (f'[[unit]]\nname = "{PurePath(answer.source).stem}"\ny = "{answer.roles.output}"\nu = [{names}]\n{dt}'
-            f'model = "{answer.model!r}"\ntracker = "AdaptiveKalman()"\nalarm = {{ every = "1 week" }}\n')  # fmt: skip
+    own = dict[str, Any](name=PurePath(answer.source).stem, y=answer.roles.output, u=answer.model.input_names)
+    own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
+    each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
+    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
+    return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
 
 
-def lines(answer: Answer) -> list[tuple[str, str]]:
+def lines(answer: Identification) -> list[tuple[str, str]]:
     """The lines of the terminal, each with its style."""
-    found = [("bold", line) for line in wrap(headline(answer), WIDTH - 1)]
+    found = [("bold", line) for line in wrap(conclusion(answer), WIDTH - 1)]
     for one in answer.effects:
         moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-        text = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}, {delay(answer, one.name)}{moved}"
-        found.append(("", f"{one.name:<20} {text}"))
+        size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
+        found.append(("", f"{one.name:<20} {size}, {delay(answer, one.name)}{moved}"))
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
-    rest = {"Data": answer.notes, "Not decided": answer.undecided}
-    said = [*chosen(answer), *columns(answer), *(f"{head}: {'; '.join(each)}." for head, each in rest.items() if each)]
-    found += [("", line) for text in said for line in wrap(text, WIDTH - 1)]
-    return [(style, f" {line}") for style, line in found + [("dim", one) for one in commands(answer)]]
+    said = [f"{head}: {'; '.join(each)}." for head, each in
+            (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
+    said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
+    short = [line if len(line) < WIDTH else line.replace(" --model", " \\\n   --model") for line in commands(answer)]
+    return [
+        (style, f" {line}") for style, line in (*found, *(("", one) for one in said), *(("dim", one) for one in short))
+    ]
 
 
 def finite(value: Any) -> Any:
     """Plain data: lists, strings, numbers, and None for numbers that are not finite."""
+    value = value._asdict() if hasattr(value, "_asdict") else value
     if isinstance(value, Mapping):
         return {str(key): finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -199,27 +211,28 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def as_json(answer: Answer) -> dict[str, Any]:
-    """The answer in the form of `SCHEMA`."""
+def as_json(answer: Identification) -> dict[str, Any]:
+    """The answer as plain data, in the form of `driftfit.identify.page.SCHEMA`."""
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
-    shown = ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
     found: dict[str, Any] = finite({
-        "schema": NAME, "answer": answer.kind, "headline": headline(answer), "why": answer.why,
-        "model": repr(answer.model), "p": answer.verdict.p, "roles": {name: getattr(roles, name) for name in shown},
-        "structure": {"na": structure.na, "inputs": inputs, "second": second},
-        "effects": [one._asdict() for one in answer.effects], "moves": [one._asdict() for one in answer.moves],
-        "errors": [one._asdict() for one in answer.errors], "memory": answer.memory._asdict(),
+        "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
+        "model": repr(answer.model), "p": answer.verdict.p, "roles": {
+            name: getattr(roles, name)
+            for name in ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
+        },
+        "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
-        "notes": answer.notes, "undecided": answer.undecided, "commands": commands(answer),
-        "unit": unit(answer),
+        "commands": commands(answer), "unit": unit(answer),
+        "why": answer.why,
+        **{name: getattr(answer, name) for name in ("effects", "moves", "errors", "memory", "notes", "undecided")},
     })  # fmt: skip
     return found
 
 
-def figure(answer: Answer) -> Figure:
-    """The output with its prediction, and the static gain of the first four inputs with dates of changes."""
+def figure(answer: Identification) -> Figure:
+    """The picture of the page: the output with its prediction, and the static gain of the first four inputs."""
     run, shown = answer.track, answer.model.input_names[:4]
     drawn, axes = panels(None, (9.5, 2.4 + 1.6 * max(len(shown), 1)), 1 + len(shown), sharex=True)
     draw_prediction(axes[0], run)
@@ -240,23 +253,22 @@ def figure(answer: Answer) -> Figure:
     return drawn
 
 
-def html(answer: Answer) -> str:
-    """The page."""
+def html(answer: Identification, path: Any = None) -> str:
+    """The answer as one self-contained HTML page; with a ``path`` it is written there."""
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
     subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
-    first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([headline(answer)])}'
-    return document(heading, [first, *body(answer)])
+    first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([conclusion(answer)])}'
+    return written(document(heading, [first, *body(answer)]), path)
 
 
-def body(answer: Answer) -> list[str]:
+def body(answer: Identification) -> list[str]:
     """The sections of a page below the headline."""
     cause, curve = answer.cause, ""
     leads = (f"{name} {one[0]:.1f} +- {one[1]:.1f}" for name, one in
              (("tracked parameters", cause.tracked), ("a curve", cause.curve), ("both", cause.joint)))  # fmt: skip
     if answer.kind in KINDS[1:3] and answer.model.input_names:
-        signals = f"y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
-        call = f"track({answer.curve.model!r}, RLS(1.0), {signals})"
-        curve = f"<p>A model with that curve, fitted:</p><pre>{escape(call)}</pre>"
+        signals = f"RLS(1.0), y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
+        curve = f"<p>That curve, fitted:</p><pre>{escape(f'track({answer.curve.model!r}, {signals})')}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
@@ -264,11 +276,10 @@ def body(answer: Answer) -> list[str]:
         section("The picture", picture(figure(answer), answer.track, CAPTION)),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
-        section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer)])),
+        section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer.roles)])),
         section("Problems of the data", _listed(answer.notes) or "<p>None.</p>"),
         section("What it could not decide", _listed(open_)),
         section("To go on", f"{copied}<p>The last is a unit for <code>driftfit serve</code>.</p>"),
-        facts([("Model", repr(answer.model))]),
     ]
 
 
@@ -276,15 +287,14 @@ def _listed(sentences: Any) -> str:
     return points([escape(one) for one in sentences])
 
 
-def _effects(answer: Answer) -> str:
-    rows = [(escape(name), delay(answer, name), number(gain), f"{std:.2g}", number(least))
+def _effects(answer: Identification) -> str:
+    rows = [(escape(name), delay(answer, name), number(gain) + escape(units(answer, name)), f"{std:.2g}", number(least))
             for name, gain, std, least in answer.effects]  # fmt: skip
     heads = ("input", "delay", answer.effect, "+-", "smallest change found")
-    caption = "Effects with constant parameters, in units of the output per unit of the input."
-    return table(caption, heads, rows, (1,)) if rows else ""
+    return table("Effects with constant parameters, in units of the output per unit of the input.", heads, rows, (1,))
 
 
-def _errors(answer: Answer) -> str:
+def _errors(answer: Identification) -> str:
     heads, rows = tuple(answer.errors[0].rms), []
     for steps, rms, samples in answer.errors:
         style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
@@ -294,12 +304,118 @@ def _errors(answer: Answer) -> str:
     return table(caption, ("", *heads, "samples"), rows)
 
 
-def many(verdict: ManyVerdicts, worst: Mapping[Any, Answer]) -> str:
-    """The page of many records: the table first, then those that move most clearly."""
-    heads = ("record", "what moves", "p", "q", "error", "of constants", "pays")
+def page_of_many(answer: ManyIdentified, path: Any = None) -> str:
+    """One page: the table of all records, then the three that move most clearly."""
+    heads, verdict = ("record", "what moves", "p", "q", "error", "of constants", "pays"), answer.verdict
     rows = [(escape(str(row.key)), *map(escape, row.cells)) for row in verdict.rows]
-    parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences)]
-    parts.append(section("All records", table("The clearest first.", heads, rows, (1,))))
-    for key, one in worst.items():
-        parts += [f"<h2>{escape(str(key))}</h2>", opening([headline(one)]), *body(one)]
-    return document(f"{len(rows)} records", parts)
+    shown = table("The clearest first.", heads, rows, (1,)) + _listed(columns(answer.roles))
+    parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences), section("All records", shown)]
+    for key, one in answer.worst.items():
+        parts += [f"<h2>{escape(str(key))}</h2>", opening([conclusion(one)]), *body(one)]
+    return written(document(f"{len(rows)} records", parts), path)
+
+
+@dataclass(frozen=True)
+class Identification(Printed):
+    """The result of `identify` for one record; printing it shows some 25 lines.
+
+    Attributes
+    ----------
+    kind, why : str
+        "moves", "a static curve explains it", "both", "no drift found", or "cannot decide" and why.
+    model, track, verdict
+        The `ARX` model that was chosen, its run with the default tracker, and the verdict on its parameters.
+    roles, structure, cause
+        What each column is; what was chosen and what came second; what explains the record, in nats.
+    effects, moves, memory, errors
+        Effects of the inputs with constants; what changed; the lags of y; errors one step and ``horizon`` steps ahead.
+    notes, undecided : tuple of str
+        Problems of the data; what could not be decided.
+    """
+
+    kind: str
+    why: str
+    model: ARX
+    track: Track = field(repr=False)
+    verdict: Verdict = field(repr=False)
+    roles: Roles = field(repr=False)
+    structure: Structure
+    cause: Cause = field(repr=False)
+    effects: tuple[Effect, ...]
+    moves: tuple[Move, ...]
+    memory: Memory
+    errors: tuple[Errors, ...]
+    notes: tuple[str, ...]
+    undecided: tuple[str, ...]
+    source: str
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command: 0 answered, 1 undecided."""
+        return int(self.kind == "cannot decide")
+
+    @property
+    def effect(self) -> str:
+        """What the effects are: there may be no long run, and without inputs there is only a level."""
+        lasting = "static gain" if self.model.input_names else "level"
+        return "effect in a sample" if self.memory.root else lasting
+
+    @cached_property
+    def alarms(self) -> Alarms:
+        """Alarms whose reference is what followed the last change; ``alarms.rule`` is armed from now on."""
+        last, T = max((move.at for move in self.moves), default=0), len(self.track)
+        start = last if T - last > T // 4 else 3 * T // 4
+        return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
+
+    @cached_property
+    def curve(self) -> Track:
+        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several, with constants."""
+        model, bent = self.model, self.cause.bent
+        bases = [Polynomial(3) if bent < 0 or name == self.roles.inputs[bent] else None for name in model.input_names]
+        nb, nk = zip(*model.lags, strict=True)
+        curved = HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
+        fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
+        return fitted
+
+    headline = property(conclusion)
+    json, plot, page = as_json, figure, html
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for style, line in lines(self):
+            yield Text(line, style)
+
+
+@dataclass(frozen=True)
+class ManyIdentified(Printed):
+    """The result of `identify` for records with one structure: the fleet, its verdicts, the clearest three by key."""
+
+    model: ARX
+    track: Fleet = field(repr=False)
+    verdict: ManyVerdicts = field(repr=False)
+    worst: Mapping[Any, Identification]
+    roles: Roles = field(repr=False)
+    page = page_of_many
+
+    @property
+    def headline(self) -> str:
+        """The answer in a sentence."""
+        return self.verdict.sentences[0]
+
+    @property
+    def code(self) -> int:
+        """Exit code of the command: 1 if no record could be judged."""
+        return int(all(row.drifts is None for row in self.verdict.rows))
+
+    def json(self) -> dict[str, Any]:
+        """The records by key, and in ``worst`` the clearest as for one record."""
+        rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
+        worst = {str(key): one.json() for key, one in self.worst.items()}
+        shown = {"schema": f"{NAME}/records", "headline": self.headline}
+        return shown | {"records": finite(rows), "worst": worst}
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
+        yield Text(" " + "\n ".join(columns(self.roles)))
+        yield self.verdict
+        for key, one in self.worst.items():
+            yield Text(f"\n {key}: {one.headline}")

@@ -1,15 +1,10 @@
 """Roles: what each column of a table is, so that y, u, time and key need not be given.
 
-| role | a column |
-|---|---|
-| time | that holds dates, or, where none does, the first whose numbers increase by even steps |
-| key | of text with few values; or the records between the places where the clock runs back |
-| label | of 0 and 1 that changes at less than `SWITCHES` of the rows, such as an operator's mark of a fault |
-| left out | of other text, a constant, a copy of another column, a second clock, mostly empty |
-| output | named, or the only column of numbers that is left |
-| inputs | the other columns of numbers |
-
-Fault codes and spikes are missing, in inputs as in y (`driftfit.readings.screen.apart`).
+The time holds dates, or, where no column does, is the first whose numbers increase by even steps. The key is text with
+few values, or tells the records between which the clock runs back. A label is 0 or 1 and changes at less than
+`SWITCHES` of the rows, as an operator's mark of a fault. Inputs are the other columns of numbers, without constants,
+copies, second clocks and what is mostly empty. Fault codes and spikes are missing, in inputs as in y
+(`driftfit.readings.screen.apart`).
 """
 
 from __future__ import annotations
@@ -72,9 +67,11 @@ class Roles:
         time = None if self.time is None else self.time[at]
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at))
 
-    def record(self, key: Any) -> Roles:
-        """The rows of one key."""
-        return replace(self.rows(np.array([t for t, one in enumerate(self.key) if one == key])), by=None)
+    def last(self, count: int) -> Roles:
+        """The last rows; without a clock their numbers are the time."""
+        at = np.arange(len(self.y) - count, len(self.y))
+        kept = self.rows(at)
+        return kept if self.time is not None else replace(kept, time=at.astype(float), dt=1.0)
 
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
@@ -86,12 +83,13 @@ class Roles:
         """The arguments of `track` for some inputs."""
         columns: dict[str, Any] = {self.output: self.y, **dict(zip(self.inputs, self.U.T, strict=True))}
         table = pl.DataFrame(columns | ({} if self.by is None else {self.by: self.key}))
-        if self.clock is not None:
-            time = pl.Series(self.clock, self.time)
+        clock = None if self.time is None else self.clock or "number of the row"
+        if clock is not None:
+            time = pl.Series(clock, self.time)
             time = time.dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone) if self.zone else time
             table = table.with_columns(time)
         units = {name: unit for name, unit in self.units.items() if name in (*inputs, self.output)} or None
-        given = {"y": self.output, "u": list(inputs) or None, "data": table, "time": self.clock}
+        given = {"y": self.output, "u": list(inputs) or None, "data": table, "time": clock}
         return given | {"dt": self.dt, "units": units}
 
     def spread(self, longest: int) -> tuple[Array, Array, Array]:
@@ -113,6 +111,8 @@ def roles(
 ) -> Roles:  # fmt: skip
     """The roles of the columns of a table or file; ValueError for names that it does not have, and without a y."""
     frame, units = _frame(data, wanted or Wanted(()))
+    if len(several := [name for name in str(y).split(",") if name in frame.columns]) > 1 and y not in frame.columns:
+        raise ValueError(f"identify: it explains one output; call it for {' and for '.join(several)}.")
     for name in filter(None, (y, time, by, *(u or ()), *not_u, *(limits or ()))):
         if name not in frame.columns:
             raise ValueError(f"identify: no column {name!r}; {near(name, frame.columns)}")
@@ -129,21 +129,20 @@ def roles(
         y = left[0]
     if y not in numbers:
         raise NoAnswerError(f"the output {y} holds text, such as {frame[y][0]!r}; numbers are needed.")
-    refused = {}
-    for name in {*left, y, *(u or ())} & numbers.keys():
+    refused, kept = {}, list(u or ())
+    for name in {*left, y, *kept} & numbers.keys():
         low, high = (limits or {}).get(name) or (None, None)
         x = numbers[name]
         bad = (x < (-np.inf if low is None else low)) | (x > (np.inf if high is None else high))
         bad |= apart(np.where(bad, np.nan, x)) & codes
         numbers[name], refused[name] = np.where(bad, np.nan, x), int(bad.sum())
-    kept = list(u or ())
     why |= {name: "not in --u" for name in left if kept and name not in (y, *kept)}
     for name in (one for one in left if one != y and u is None):
         if reason := _reason(numbers, name, [y, *kept]):
             why[name] = reason
         else:
             kept.append(name)
-    key, by = _key(frame, texts, by, axis)
+    key, by = _key(frame, [name for name in texts if name not in not_u], by, axis)
     why |= {name: "text" for name in texts if name != by}
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}
@@ -201,21 +200,16 @@ def _clock(
         except (ValueError, TypeError) as error:
             if time is not None:
                 raise ValueError(f"identify: --time {time}: {error}") from None
-    counting = [
-        name for name, x in numbers.items() if name == time or (time is None and name not in given and _counts(x))
-    ]
-    found |= {name: (numbers[name], None) for name in counting}
+    free = () if time is not None else numbers.keys() - given
+    found |= {name: (x, None) for name, x in numbers.items() if name == time or (name in free and _counts(x))}
     clock = next(iter(found), None)
     return clock, *found.get(clock or "", (None, None)), {name: "a second clock" for name in found if name != clock}
 
 
 def _counts(x: Array) -> bool:
     """Whether a column of numbers is complete and increases by even steps nearly everywhere."""
-    step = np.diff(x)
-    even = (
-        np.abs(step - np.median(step)) < 0.5 * np.median(step) if len(x) > 2 and np.isfinite(x).all() else np.zeros(1)
-    )
-    return bool(np.mean(step > 0.0) > 0.99 and np.mean(even) > 0.8)
+    step, middle = np.diff(x), float(np.median(np.diff(x))) if len(x) > 2 else 0.0
+    return bool(np.mean(np.abs(step - middle) < 0.5 * middle) > 0.8 and np.mean(step > 0.0) > 0.99)
 
 
 def _is_label(x: Array) -> bool:

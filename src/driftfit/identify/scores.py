@@ -48,11 +48,9 @@ class Scores:
         self.rest = np.stack([np.tensordot(one, self.G, 1) for one in shares]) + RIDGE * np.eye(self.p + 1)
         self.floor = 0.0
 
-    def refer(self, S: list[int]) -> float:
-        """Set the floor by a regression; the variance of its errors."""
-        variance = float(self._fit(S)[0].sum(axis=1).min() / self.count.sum())
-        self.floor = FLOOR * variance
-        return variance
+    def refer(self, S: list[int]) -> None:
+        """Set the floor by a regression."""
+        self.floor = FLOOR * float(self._fit(S)[0].sum(axis=1).min() / self.count.sum())
 
     def _fit(self, S: list[int]) -> tuple[Array, Array]:
         """(sums of squares (L, B), coefficients (L, B, k))."""

@@ -22,13 +22,13 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.scores import FEWEST, Scores, lead
+from driftfit.use.simulate import moved
 
 COLUMN = 1.5
 """Price of a column in nats, about half the logarithm of the rows that a coefficient needs."""
 TIED = 2.0
 """Nats within which delays and inputs are said to be as good."""
 COPIES = 19
-OUTPUT_LAGS = 8
 COLUMNS = 250
 """Columns that the search holds in memory: 80 blocks and four memories of them take a fifth of a gigabyte."""
 FILLED = 3
@@ -44,7 +44,8 @@ class Structure:
 
     ``delays``: the least and the largest nk that are as good. ``second``: other structures, by how many nats they are
     behind, and the standard error of that. ``doubtful``: inputs that are no better than displaced copies. ``instead``:
-    pairs of an input and one that could replace it. ``forecast``: the same with nk of at least 1, if it is another.
+    pairs of an input and one that could replace it. ``log``: by how many nats the same of the logarithm of a positive
+    output leads, on the scale of the output. ``forecast``: the same with nk of at least 1, if it is another.
     ``narrowed``: where the search was cut short.
     """
 
@@ -54,6 +55,7 @@ class Structure:
     second: tuple[tuple[Shape, float, float], ...] = ()
     doubtful: tuple[int, ...] = ()
     instead: tuple[tuple[int, int], ...] = ()
+    log: tuple[float, float] = (0.0, 0.0)
     forecast: Structure | None = None
     narrowed: str = ""
 
@@ -63,22 +65,16 @@ class Structure:
 
 
 def filled(x: Array) -> Array:
-    """A signal (T,) with at most `FILLED` missing readings in a row replaced by the last one, but not across gaps in
-    time, which are inf; NaN for what stays missing."""
+    """A signal (T,) whose last reading replaces up to `FILLED` missing ones, not across gaps in time, which are inf."""
     t, known = np.arange(len(x)), ~np.isnan(x)
     last = np.maximum.accumulate(np.where(known, t, 0))
     return np.where((t - last <= FILLED) & np.isfinite(x[last]), x[last], np.nan)
 
 
-def lagged(x: Array, k: int) -> Array:
-    """A signal k samples ago."""
-    return np.concatenate([np.full(k, np.nan), x[: len(x) - k]])
-
-
 class Pool:
     """All columns of a record on a regular grid: 1, na lags of y (T,), lags first..M of every column of U (T, m)."""
 
-    def __init__(self, y: Array, U: Array, M: int, first: int = 0, na: int = OUTPUT_LAGS, more: Array | None = None):
+    def __init__(self, y: Array, U: Array, M: int, first: int = 0, na: int = 8, more: Array | None = None):
         past, U = filled(y), np.column_stack([filled(u) for u in U.T]) if U.shape[1] else U
         self.m, self.M, self.na = U.shape[1], M, na
         self.place: dict[tuple[int, int], int] = {}
@@ -86,7 +82,7 @@ class Pool:
         for j, x in [(-1, past), *enumerate(U.T)]:
             for k in range(1, na + 1) if j < 0 else range(first, M + 1):
                 self.place[j, k] = len(columns)
-                columns.append(lagged(x, k))
+                columns.append(moved(x, k))
         X = np.column_stack([*columns, *([] if more is None else [more])])
         self.rows = np.flatnonzero(np.isfinite(X).all(axis=1) & np.isfinite(y))
         if len(self.rows) < FEWEST:
@@ -100,9 +96,8 @@ class Pool:
         return [0, *each, *(self.place[j, k] for j, nb, nk in inputs for k in range(nk, nk + nb))]
 
     def fits(self, shape: Shape) -> bool:
-        na, inputs = shape
-        return 0 <= na <= self.na and all(nb >= 1 and (j, nk) in self.place and nk + nb - 1 <= self.M
-                                          for j, nb, nk in inputs)  # fmt: skip
+        inside = (nb >= 1 and (j, nk) in self.place and nk + nb - 1 <= self.M for j, nb, nk in shape[1])
+        return 0 <= shape[0] <= self.na and all(inside)
 
     def value(self, shape: Shape) -> float:
         """The score less the price."""
@@ -173,29 +168,37 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     if doubtful:  # the others may need other lags without them
         shape = without(pool.climb(without(shape, doubtful), end), doubtful)
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
-    return _told(pool, shape, doubtful, narrowed)
+    return _told(pool, shape, doubtful, _of_log(pool, shape, y, U, first), narrowed)
 
 
-def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], narrowed: str) -> Structure:
+def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float, float], narrowed: str) -> Structure:
     """A structure with its rivals."""
     own, (na, inputs) = pool.scores.terms(pool.columns(shape)), shape
     base, delays, instead = float(own.sum()), {}, []
     for j, nb, nk in inputs:
-        rest, ends = without(shape, (j,))[1], []
-        for step in (-1, 1):
-            k = nk
-            while (
-                pool.fits(near := (na, (*rest, (j, nb, k + step))))
-                and base - pool.scores.score(pool.columns(near)) < TIED
-            ):
-                k += step
-            ends.append(k)
+        rest, ends = without(shape, (j,))[1], [nk, nk]
+        for side, step in enumerate((-1, 1)):
+            while pool.fits(near := (na, (*rest, (j, nb, ends[side] + step)))):
+                if base - pool.scores.score(pool.columns(near)) >= TIED:
+                    break
+                ends[side] += step
         delays[j] = ends[0], ends[1]
         instead += [(j, i) for i, (score, _) in pool.best_delays((na, rest)).items() if i != j and base - score < TIED]
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
     second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
     lags = {j: (nb, nk) for j, nb, nk in inputs}
-    return Structure(na, lags, delays, second, doubtful, tuple(instead), narrowed=narrowed)
+    return Structure(na, lags, delays, second, doubtful, tuple(instead), log, narrowed=narrowed)
+
+
+def _of_log(pool: Pool, shape: Shape, y: Array, U: Array, first: int) -> tuple[float, float]:
+    """The lead of a structure of log y over that of y, on the scale of y: d log y = dy / y."""
+    own, S = pool.scores, pool.columns(shape)
+    if not np.all((y > 0.0) | np.isnan(y)):
+        return 0.0, 0.0
+    other = Pool(np.log(y), U, pool.M, first).scores
+    other.refer(S)
+    slope = np.add.reduceat(np.log(y[pool.rows]), np.cumsum(own.count).astype(int) - own.count.astype(int))
+    return lead(other.terms(S) - own.count * np.log(other.size / own.size) - slope, own.terms(S))
 
 
 def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
@@ -213,8 +216,8 @@ def _beats_copies(y: Array, U: Array, shape: Shape, j: int, rng: np.random.Gener
     x = filled(U[:, j])
     x, copies = np.where(np.isfinite(x), x, np.nanmean(x)), []
     for k in range(COPIES):
-        moved = np.roll([x, x[::-1]], int(rng.integers(T // 10, T - T // 10)))[0][:: 1 if k % 2 else -1]
-        copies += [np.roll(moved, lag) for lag in range(0, 24, 3)]
+        other = np.roll([x, x[::-1]], int(rng.integers(T // 10, T - T // 10)))[0][:: 1 if k % 2 else -1]
+        copies += [np.roll(other, lag) for lag in range(0, 24, 3)]
     depth = max(nb + nk - 1 for _, nb, nk in shape[1])
     pool = Pool(y, U[:, used], max(depth, 1), na=max(shape[0], 1), more=np.column_stack(copies))
     base = pool.columns((shape[0], tuple((used.index(i), nb, nk) for i, nb, nk in without(shape, (j,))[1])))

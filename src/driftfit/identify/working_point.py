@@ -21,14 +21,13 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.identify.scores import MEMORIES, Scores, lead
-from driftfit.identify.structure import Structure, filled, lagged
+from driftfit.identify.structure import Structure, filled
+from driftfit.use.simulate import moved
 
 SLOW = 20
 """Samples in the mean of the last outputs."""
 CLEAR = 3.0
 """Nats by which one description must lead another: -log of a level of 5 %."""
-
-Lead = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -40,9 +39,9 @@ class Cause:
     static curve, or -1.
     """
 
-    tracked: Lead
-    curve: Lead
-    joint: Lead
+    tracked: tuple[float, float]
+    curve: tuple[float, float]
+    joint: tuple[float, float]
     products: tuple[str, ...]
     bent: int
     columns: Array
@@ -83,20 +82,13 @@ def products(
     past, inputs = filled(y), [filled(u) for u in U.T]
     slow = np.convolve(np.where(np.isfinite(past), past, np.nanmean(past)), np.full(SLOW, 1.0 / SLOW))[: len(y)]
     slow[: SLOW - 1] = np.nan
-    signals = [(f"{output}, the last", lagged(past, 1)), (f"the level of {output}", lagged(slow, 1))]
-    signals += [(names[i], lagged(x, first)) for i, x in enumerate(inputs)]
-    xs = [(names[j], j, lagged(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    xs += [(output, -1, lagged(past, 1))] if structure.na else []
-    made = [
-        (f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
-        for name, j, x in xs
-        for q in np.nanquantile(x, (0.25, 0.5, 0.75))
-    ]
-    made += [
-        (f"{name} times {other}", -1, x * bend)
-        for name, _, x in xs
-        for other, w in signals
-        for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))
-        if not np.array_equal(w, x, equal_nan=True)
-    ]
+    signals = [(f"{output}, the last", moved(past, 1)), (f"the level of {output}", moved(slow, 1))]
+    signals += [(names[i], moved(x, first)) for i, x in enumerate(inputs)]
+    xs = [(names[j], j, moved(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
+    xs += [(output, -1, moved(past, 1))] if structure.na else []
+    made = [(f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
+            for name, j, x in xs for q in np.nanquantile(x, (0.25, 0.5, 0.75))]  # fmt: skip
+    made += [(f"{name} times {other}", -1, x * bend)
+             for name, _, x in xs for other, w in signals if not np.array_equal(w, x, equal_nan=True)
+             for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))]  # fmt: skip
     return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, j) for text, j, _ in made]

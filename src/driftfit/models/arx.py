@@ -249,3 +249,9 @@ def _steps(
 
     late = all(delay > 0 for _, delay in lags)
     return ModelSteps(regress, push, apply=take_input if late else None, ages=oldest, refuse=refuse_lag)
+
+
+def arx_text(model: ARX) -> str:
+    """An ARX model with an intercept as `driftfit.parsing.settings.parse_model` reads it."""
+    nb, nk = ("/".join(str(one[i]) for one in model.lags) for i in (0, 1))
+    return f"arx:{model.na},{nb or 0}{nk and f',nk={nk}'},intercept"

@@ -72,7 +72,7 @@ def report(
     OSError
         If the file cannot be written.
     """
-    check_path(path).write_text(page(run, title, alarms, labels), encoding="utf-8")
+    written(page(run, title, alarms, labels), path)
 
 
 def check_path(path: str | PathLike[str]) -> Path:
@@ -80,6 +80,13 @@ def check_path(path: str | PathLike[str]) -> Path:
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"report: the page is HTML, so its name must end in .html; got {str(path)!r}.")
     return Path(path)
+
+
+def written(text: str, path: str | PathLike[str] | None) -> str:
+    """The text of a page, which is written where there is a path."""
+    if path is not None:
+        check_path(path).write_text(text, encoding="utf-8")
+    return text
 
 
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:

@@ -81,6 +81,18 @@ def ahead(run: Track, k: int) -> Prediction:
     return Prediction(*(np.where(whole_time, moved(part, k), np.nan) for part in found))
 
 
+def steps_ahead(theta: Array, phi: Array, na: int, h: int) -> Array:
+    """Predictions (T,) h steps ahead, from theta (T, n) known before each sample and phi (T, n): na lags of the output,
+    and regressors that are given."""
+    made: list[Array] = []
+    for s in range(h):
+        now = moved(phi, -s)
+        for i in range(min(s, na)):
+            now[:, i] = made[s - 1 - i]
+        made.append(np.einsum("tn,tn->t", theta, now))
+    return moved(made[-1], h - 1)
+
+
 def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     """Free simulation of the model at one sample: the outputs that inputs u (h,) or (h, m) would cause.
 
