@@ -91,14 +91,13 @@ def test_a_fault_code_at_the_start_does_no_harm_in_any_unit(tracker, scale):
         assert away[-1].max() < 0.001, k
 
 
-@pytest.mark.parametrize("model", [Regression(1), ARX(1, 1), PLANT], ids=repr)
+@pytest.mark.parametrize("model", [Regression(1), ARX(1, 1)], ids=repr)
 @pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-7, r=0.01)], ids=repr)
 def test_no_sample_is_between_those_judged_together_and_those_judged_alone(model, tracker):
     """With few parameters a start had fewer samples than the judging of single samples waits for."""
-    y, u = plant()
-    if model is not PLANT:
-        y = lfilter([0.0, 1.0], [1.0, -0.7], u) + 0.1 * np.random.default_rng(1).normal(size=T)
-        y[2] = y[1]  # a reading that repeats itself counts once
+    _, u = plant()
+    y = lfilter([0.0, 1.0], [1.0, -0.7], u) + 0.1 * np.random.default_rng(1).normal(size=T)
+    y[2] = y[1]  # a reading that repeats itself counts once
     rows = np.repeat([y[:200], u[:200]], 21, axis=0).reshape(2, 21, -1)
     rows[0, range(1, 21), range(20)] = 9999.0
     fleet = gated(model, tracker, *rows, by="row")
@@ -118,86 +117,6 @@ def test_models_that_compute_signals_begin_without_the_fault(model, tracker, at)
     clean = gated(model, tracker, y, u).theta[-1]
     found = gated(model, tracker, np.where(np.arange(200) == at, 1e7, y), u).theta[-1]
     np.testing.assert_allclose(found, clean, atol=0.2)
-
-
-@pytest.mark.parametrize("signal", [0, 1])
-def test_a_fault_code_at_the_very_first_reading_does_no_harm(signal):
-    """It is in one equation only, as a lag, and may leave the residuals of the others little larger."""
-    clean = np.array([plant(seed=seed) for seed in range(40)]).swapaxes(0, 1)[..., :200]
-    bad = clean.copy()
-    bad[signal, :, 0] = 9999.0
-    whole, fleet = (gated(PLANT, RLS(1.0), *both, by="row") for both in (clean, bad))
-    assert max(np.abs(fleet[k].theta[-1] - whole[k].theta[-1]).max() for k in range(40)) < 0.05
-
-
-@pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
-def test_two_fault_codes_among_the_first_ten_samples_do_no_harm(tracker):
-    """They are in six of the first eight equations, so the start waits for more."""
-    y, u = plant()
-    two = y.copy()
-    two[[2, 7]] = 9999.0
-    fleet = gated(PLANT, tracker, np.stack([y, two]), np.stack([u, u]), by="row")
-    assert np.abs(fleet[1].theta - fleet[0].theta)[60].max() < 0.02
-    assert fleet[1].left_out.sample.tolist() == [2, 7]
-
-
-@pytest.mark.parametrize("tracker", [RLS(0.98), Kalman(q=1e-4, r=0.01)], ids=repr)
-def test_what_is_no_fault_is_learned_from(tracker):
-    """A large test, a gain that changes, and a new level a hundred deviations away, which costs a few samples."""
-    rng = np.random.default_rng(3)
-    u = 0.01 * rng.normal(size=T)
-    u[200], u[300:] = 10.0, rng.normal(size=200)
-    noise = 0.1 * rng.normal(size=T)
-    run = gated(Regression(1), tracker, 2.0 * u + noise, u)
-    assert not len(run.left_out)
-    assert abs(run.theta[200, 0] - 2.0) < 0.05
-    u = rng.normal(size=T)
-    run = gated(Regression(1), tracker, np.where(np.arange(T) < 250, 2.0, -4.0) * u + noise, u)
-    assert not len(run.left_out)
-    run = gated(Regression(0, intercept=True), tracker, np.where(np.arange(T) < 250, 0.0, 10.0) + noise)
-    assert len(run.left_out) <= 3
-    assert abs(run.theta[-1, 0] - 10.0) < 0.1
-
-
-RUNS = {
-    "one code": lambda y: np.full_like(y, 9999.0),
-    "of either sign": lambda y: np.where(np.arange(y.size).reshape(y.shape) * 7 % 5 < 3, -999.0, 999.0),
-    "in turn": lambda y: np.where(np.arange(y.shape[1]) % 2 == 0, 9999.0, -999.0) + 0.0 * y,
-    "with good readings between": lambda y: np.where(np.arange(y.shape[1]) % 4 == 3, y, -999.0),
-    "after a gap": lambda y: np.where(np.arange(y.shape[1]) < 5, np.nan, -999.0) + 0.0 * y,
-}
-
-
-@pytest.mark.parametrize("run", list(RUNS))
-@pytest.mark.parametrize("tracker", DIFFUSE, ids=repr)
-def test_a_run_of_codes_is_a_gap(tracker, run):
-    """Up to the sixteenth repeat, after which nothing may tell a code from a level."""
-    y, u = np.array([plant(seed=seed) for seed in range(8)]).swapaxes(0, 1)
-    bad = y.copy()
-    bad[:, 200:216] = RUNS[run](bad[:, 200:216])
-    gaps, fleet = (
-        gated(PLANT, tracker, np.where(bad == y, y, np.nan), u, by="row"),
-        gated(PLANT, tracker, bad, u, by="row"),
-    )
-    for k in range(8):
-        np.testing.assert_allclose(fleet[k].theta, gaps[k].theta, atol=1e-9)
-        assert len(fleet[k].left_out) == np.sum(np.isfinite(bad[k]) & (bad[k] != y[k]))
-
-
-@pytest.mark.filterwarnings("ignore:.*2 values look like fault codes")  # the two that the jump costs behind a gate
-@pytest.mark.parametrize("tracker", [RLS(0.99), Kalman(q=1e-4, r=0.01)], ids=repr)
-@pytest.mark.parametrize("level", [100.0, 1e4])
-@pytest.mark.parametrize("gap", [0, 5])
-def test_a_new_level_costs_two_samples_also_after_a_gap(tracker, level, gap):
-    """After that the tracker does as well as without a gate, within a tenth."""
-    y, u = plant(seed=1)
-    y[250:] += level
-    y[250 : 250 + gap] = np.nan
-    model = ARX(2, 2, intercept=True)
-    run, off = gated(model, tracker, y, u), track(model, tracker, y, u)
-    assert len(run.left_out) <= 3
-    errors = [np.median(np.abs(one.innovation[300:])) for one in (run, off)]
-    assert errors[0] < 1.1 * errors[1]
 
 
 FILTERED = pytest.mark.xfail(reason="filters of refused inputs are held instead of continued", strict=True)

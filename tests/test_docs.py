@@ -65,7 +65,6 @@ def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
 WARNED = {"examples/counts.py", "examples/segmentation.py"}
 """Scripts whose rare counts and changes of level are warned of as if they were codes, since no gate judges them."""
 
-
 SHOWN = [
     pytest.param(one, marks=pytest.mark.filterwarnings("ignore:.*looks? like (a )?fault code") if one in WARNED else ())
     for one in pages.shown()

@@ -120,16 +120,6 @@ def test_a_fault_code_is_left_out_and_does_no_harm(code, count):
     assert run.left_out.sample.tolist() == [*range(100, 100 + count)]
 
 
-def test_a_change_of_level_that_stays_is_taken_in():
-    rng = np.random.default_rng(4)
-    u = np.column_stack([rng.normal(size=T), rng.normal(size=T), np.ones(T)])
-    for size in (10.0, 1000.0):
-        y = u @ [1.0, 0.5, 0.0] + size * (np.arange(T) >= 700) + 0.1 * rng.normal(size=T)
-        run = track(MODEL, AdaptiveKalman(), y, u)
-        assert np.abs(run.theta[720:] - [1.0, 0.5, size]).max() < 0.5
-        assert np.sqrt(np.mean(run.innovation[800:] ** 2)) < 0.11
-
-
 def test_an_absurd_input_counts_for_little():
     y, u = plant()
     clean = track(PLANT, AdaptiveKalman(), y, u)

@@ -42,40 +42,6 @@ def test_a_code_in_an_input_does_as_little_harm_as_a_gap(tracker):
             assert len(fleet[k].left_out) >= 1
 
 
-def honest(what):
-    """y and u of a plant that responds, with an input that was never so large before."""
-    rng = np.random.default_rng(1)
-    t, noise = np.arange(T), 0.1 * rng.normal(size=T)
-    u = {
-        "steps": 0.1 * rng.normal(size=T) + np.where(t >= 300, 3.0, 0.0),
-        "rare": (rng.random(T) < 0.03).astype(float),
-        "pulses": (rng.random(T) < 0.03) * rng.exponential(5.0, T),
-        "tails": rng.standard_t(3, T),
-        "at rest": np.where(t < 200, 0.0, rng.normal(size=T)),
-        "floods": np.exp(1.5 * lfilter([0.3], [1.0, -0.95], rng.normal(size=T))),
-    }[what]
-    return respond(u, noise), u
-
-
-@pytest.mark.parametrize("tracker", TRACKERS[:3], ids=repr)
-@pytest.mark.parametrize("what", ["steps", "rare", "pulses", "tails", "at rest", "floods"])
-def test_a_large_input_to_which_the_output_responds_is_learned_from(what, tracker):
-    run = gated(PLANT, tracker, *honest(what))
-    assert not len(run.left_out)
-
-
-@pytest.mark.parametrize("tracker", TRACKERS[:3], ids=repr)
-@pytest.mark.parametrize(("noise", "most"), [(0.1, 10), (0.0, 10)])
-def test_an_input_that_stays_without_a_response_is_believed(tracker, noise, most):
-    """A gain that is lost where the input goes up: after six samples."""
-    rng = np.random.default_rng(2)
-    u = np.where(np.arange(T) < 250, 0.1 * rng.normal(size=T), 3.0 + noise * rng.normal(size=T))
-    y = np.where(np.arange(T) < 250, 2.0 * u, 0.0) + 0.01 * rng.normal(size=T)
-    run = gated(SINGLE, tracker, y, u)
-    assert 0 < np.sum(~run.ok[250:]) <= most
-    assert abs(run.theta[-1, 0]) < 0.1
-
-
 FIRST = pytest.param(0, 5, marks=pytest.mark.xfail(reason="a code at the very first pulse is believed", strict=True))
 
 
