@@ -28,7 +28,7 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_749,
+    "lines of the library": 66_748,
     "statements": 43_281,
     "modules": 328,
     "levels of folders": 2,
