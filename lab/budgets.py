@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_749,
-    "statements": 43_281,
+    "lines of the library": 66_748,
+    "statements": 43_283,
     "modules": 328,
     "levels of folders": 2,
     "constants of modules with numbers": 631,

@@ -317,6 +317,8 @@ def enter_filters(s: State, j: int, l: int) -> None:
 def mixture(s: State, l: int) -> None:
     """Mean d and reported covariance of the filters; without a sample d keeps its bits, and no large jump begins."""
     n, K = s.parameters[l], s.modes[l]
+    if (s.ok[l] == 0.0) & (s.dt[l] == 0.0):
+        return
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
         s.curve[k, l] = s.mu[k, l] if s.ok[l] > 0.0 or s.ratio[k, l] < JUMPS else max(s.mu[k, l] - s.arrive[k, l], 0.0)
