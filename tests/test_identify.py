@@ -127,8 +127,7 @@ def test_structure_and_cause(change):
     y, U = plant(change)
     found, late = searched(y, U), searched(y, U, first=1)
     assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)}) if change != "working point" else True
-    assert 1 not in late.lags
-    assert all(nk >= 1 for _, nk in late.lags.values())
+    assert all(nk >= 1 and j != 1 for j, (_, nk) in late.lags.items())
     given = Structure(1, {0: (1, 6), 1: (1, 0)})
     phi, made = regressors(y, U), products(y, U, given, ("u1", "u2", "u3"), "y", 0)
     rows = np.isfinite(phi).all(axis=1)
@@ -163,7 +162,6 @@ def test_the_budget_narrows_the_search_and_what_is_judged():
 def test_track_without_a_model_takes_that_of_identify():
     result = CliRunner().invoke(app, ["track", PUMP, "--y", "flow"])
     assert "Chosen: --model arx:1,1/1,nk=7/2,intercept --u pressure,speed;" in result.output.splitlines()[0]
-    assert "flow from pressure, speed" in result.output
     assert "2026-03-03" in result.output
 
 
@@ -189,13 +187,10 @@ def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
 
 def test_the_answer_for_a_pump(pump):
     assert (pump.kind, pump.code, pump.model.lags) == ("moves", 0, ((1, 7), (1, 2)))
-    (move,) = pump.moves
-    assert move.what == "pressure"
-    assert 430 <= move.at <= 570
+    assert [(one.what, 430 <= one.at <= 570) for one in pump.moves] == [("pressure", True)]
     assert pump.headline.startswith("The effect of pressure on flow (delay 70 s) fell from 1.3")
-    one, ten = pump.errors
-    assert one.rms["driftfit"] < 0.95 * one.rms["constants"]
-    assert ten.steps == 10
+    assert [one.steps for one in pump.errors] == [1, 10]
+    assert pump.errors[0].rms["driftfit"] < 0.95 * pump.errors[0].rms["constants"]
     assert len(str(pump).splitlines()) <= 25
     for said in ("pump (constant)", "driftfit detect", "Not needed: temperature, humidity"):
         assert said in str(pump)

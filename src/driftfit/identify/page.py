@@ -218,10 +218,8 @@ def as_json(answer: Identification) -> dict[str, Any]:
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
-        "model": repr(answer.model), "p": answer.verdict.p, "roles": {
-            name: getattr(roles, name)
-            for name in ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")
-        },
+        "model": repr(answer.model), "p": answer.verdict.p, "roles": {one: getattr(roles, one) for one in
+        ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")},
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
         "commands": commands(answer), "unit": unit(answer),
