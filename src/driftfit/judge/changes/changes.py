@@ -60,9 +60,7 @@ def changes(model: Model, level: float, dates: float = LEVEL) -> Changes:
     if test.p < level:
         breaks, ar, prices = counted(model, test, draws, level)
     found = dated(model, breaks, ar, prices, dates)
-    changed = which(model, found) if len(breaks) else Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
-    if (changed.dates != found.breaks).any():
-        found = dated(model, changed.dates, ar, prices, dates, final=True)
+    changed = which(model, found) if len(breaks) else Which((), (), (), found.theta, found.std[1:], found.rss, n)
     moving = tuple(sorted({j for own in changed.at for j in own}))
     if test.p < level and not moving:
         moving = (int(np.argmin(test.p_path[n:])),)
