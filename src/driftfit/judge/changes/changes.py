@@ -28,8 +28,11 @@ class Changes(NamedTuple):
     found: Dated
     which: Which
     kind: Kind
-    moving: tuple[int, ...]
-    """Parameters that change."""
+
+    @property
+    def moving(self) -> tuple[int, ...]:
+        """Parameters that change."""
+        return self.kind.moves
 
     @property
     def rejected(self) -> bool:
@@ -64,7 +67,7 @@ def changes(model: Model, level: float, dates: float = LEVEL) -> Changes:
     moving = tuple(sorted({j for own in changed.at for j in own}))
     if test.p < level and not moving:
         moving = (int(np.argmin(test.p_path[n:])),)
-    own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
+    own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), (), ())
     moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
     return Changes(
         model,
@@ -73,5 +76,4 @@ def changes(model: Model, level: float, dates: float = LEVEL) -> Changes:
         found._replace(theta=found.theta + moved),
         changed._replace(theta=changed.theta + moved),
         own._replace(path=own.path + model.offset) if own.path.size else own,
-        moving,
     )
