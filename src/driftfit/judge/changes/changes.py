@@ -33,24 +33,21 @@ class Changes:
     """What `driftfit.judge.changes.dates.counted` found; no break where constants are not rejected."""
 
     @cached_property
-    def _all(self) -> tuple[Dated, Which, Kind, tuple[int, ...]]:
+    def _all(self) -> tuple[Dated, Which, Kind]:
         model, test, (breaks, ar, prices) = self.model, self.test, self.start
         N, n = model.phi.shape
         found = dated(model, breaks, ar, prices, self.dates)
-        none = Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
+        none = Which((), (), (), found.theta, found.std[1:], found.rss, n)
         changed = which(model, found) if len(breaks) else none
-        if (changed.dates != found.breaks).any():
-            found = dated(model, changed.dates, ar, prices, self.dates, final=True)
         moving = tuple(sorted({j for own in changed.at for j in own}))
         if self.rejected and not moving:
             moving = (int(np.argmin(test.p_path[n:])),)
-        own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), ())
+        own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), (), ())
         moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
         return (
             found._replace(theta=found.theta + moved),
             changed._replace(theta=changed.theta + moved),
             own._replace(path=own.path + model.offset) if own.path.size else own,
-            moving,
         )
 
     @property
@@ -71,7 +68,7 @@ class Changes:
     @property
     def moving(self) -> tuple[int, ...]:
         """Parameters that change."""
-        return self._all[3]
+        return self.kind.moves
 
     @property
     def rejected(self) -> bool:

@@ -54,6 +54,8 @@ class Kind(NamedTuple):
     """(N, n): the parameters, in units of the model, of a gradual change; empty otherwise."""
     dates: tuple[int, ...]
     """Of a drift with jumps, the dates that it needs."""
+    moves: tuple[int, ...]
+    """Parameters that change; of those that move at dates, a gradual change is of those that it needs."""
 
 
 def _filter(H: Array, steps: Array, columns: Array, scratch: tuple[Array, ...], products: Array, totals: Array) -> None:
@@ -126,18 +128,25 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     scores = {"rest": M * np.log(left(Z, z, model.floor)) + n * price}
     if K:
         scores["steps"] = M * np.log(max(changes.rss, model.floor)) + (changes.used + DATE * K) * price
-    ends, J = ramp(phi, model.y, (lags, found.ar, g), moves, CORNERS), len(moves)
-    shape = rise(N, ends)[:, None]
-    both = np.hstack([Z, white_rows(shape * phi[:, moves], model.y, lags, found.ar, g)[0]])
-    scores["gradual"] = M * np.log(left(both, z, model.floor)) + (n + J + DATE * 2) * price
-    beta = coefficients(both, z)
-    path = np.tile(beta[:n], (N, 1))
-    path[:, moves] += shape * beta[n:]
+    slow, ends, path, tried = moves, (0, N - 1), np.zeros((N, 0)), [moves]
+    while tried:
+        for own in tried:
+            at = ramp(phi, model.y, (lags, found.ar, g), own, CORNERS)
+            shape = rise(N, at)[:, None]
+            both = np.hstack([Z, white_rows(shape * phi[:, own], model.y, lags, found.ar, g)[0]])
+            score = M * np.log(left(both, z, model.floor)) + (n + len(own) + DATE * 2) * price
+            if score < scores.get("gradual", np.inf):
+                scores["gradual"], slow, ends, beta = score, own, at, coefficients(both, z)
+                path = np.tile(beta[:n], (N, 1))
+                path[:, own] += shape * beta[n:]
+        fewer = len(slow) == len(tried[0]) > 1
+        tried = [[i for i in slow if i != j] for j in slow] if fewer else []
     scores["walk"], scores["jumps"], dates = _walks(phi, model, found, changes, moves)
     weights = dict(zip(scores, scipy.special.softmax(-0.5 * np.array([*scores.values()])).tolist(), strict=True))
     names = {"rest": "", "steps": "steps", "gradual": "gradual", "walk": "wandering", "jumps": "drift with jumps"}
     likely = max((name for name in weights if name != "rest"), key=lambda name: weights[name])
-    return Kind(names[likely], weights, ends, path / np.where(size > 0.0, size, 1.0), dates)
+    path = path / np.where(size > 0.0, size, 1.0)
+    return Kind(names[likely], weights, ends, path, dates, tuple(slow if likely == "gradual" else moves))
 
 
 def _walks(
