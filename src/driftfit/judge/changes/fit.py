@@ -137,6 +137,7 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
+@Driver
 def _multiply(v: Array, G: Array) -> None:
     """G (k, k), a lower triangle: sums of products of v (N,) with the lags 1 .. k - 1, and last of v itself, from row
     k - 1 on; those of two lags follow from those of one less each."""
@@ -149,9 +150,7 @@ def _multiply(v: Array, G: Array) -> None:
             G[i + j - 1, j - 1] = before + v[last - i - j] * v[last - j] - v[N - i - j] * v[N - j]
 
 
-_multiplied = Driver(_multiply)
-
-
+@Driver
 def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
     """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
     last = G.shape[0] - 1
@@ -177,9 +176,6 @@ def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
         chosen[1] = 0
 
 
-_chosen = Driver(_choose)
-
-
 def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
     """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
     Only rows are used that are ``ok`` (N,), as are all their lags."""
@@ -192,7 +188,7 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
     if ok is None:
         count, G = N - longest, np.zeros((longest + 1, longest + 1))
         if count > 2 * longest:
-            _multiplied(v, G)
+            _multiply(v, G)
     else:
         while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
             longest -= 1  # fewer lags are known of more rows
@@ -200,7 +196,7 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
         count, G = len(at), rows.T @ rows
     if count <= 2 * longest:
         return NONE
-    _chosen(G, count, min(most, longest), found)
+    _choose(G, count, min(most, longest), found)
     lags = np.arange(1, found[0] + 1)
     return np.append(lags, found[1]) if found[1] else lags
 
@@ -237,6 +233,7 @@ def hats(N: int, knots: int) -> Array:
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(np.arange(N)[:, None] - at) / (at[1] - at[0])))
 
 
+@Driver
 def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
     """Sums of products G (knots n + 1, ..) of z (M,) and of Z (M, n) times hats (M, knots): of two of these at most."""
     n, last, k = Z.shape[1], G.shape[0] - 1, 0
@@ -251,14 +248,11 @@ def _accumulate(Z: Array, z: Array, hat: Array, row: Array, G: Array) -> None:
             G[last, k * n + i] += row[i] * z[t]
 
 
-_accumulated = Driver(_accumulate)
-
-
 def on_lines(Z: Array, z: Array, N: int, knots: int) -> tuple[Array, Array]:
     """(path (N, n), residuals) of parameters on such lines, by least squares of z on the last white rows Z of N."""
     n, hat = Z.shape[1], hats(N, knots)
     own, G = hat[N - len(z) :], np.zeros((knots * n + 1, knots * n + 1))
-    _accumulated(Z, z, own, np.empty(2 * n), G)
+    _accumulate(Z, z, own, np.empty(2 * n), G)
     path = hat @ np.linalg.solve(invertible(G[:-1, :-1]), G[-1, :-1]).reshape(knots, n)
     return path, z - np.einsum("tj,tj->t", Z, path[N - len(z) :])
 
