@@ -8,6 +8,7 @@ Shapes belong to the type of the record, so loops over parameters have bounds th
     kernel    a step, or a function that steps call: inlined into its caller, compiled for every size of the record
     shared    a function of plain arrays with run-time bounds: compiled once for all sizes and kept on disk, called
     part      the same, but inlined into the compiled routine that calls it
+    sized     a part that is compiled for each small number of parameters apart
     machine   a routine that steps call by its symbol, with addresses and numbers: compiled apart, once for all drivers
     Driver    what Python calls, with arrays and numbers
 
@@ -107,16 +108,19 @@ def shared(function: Callable[..., Any], arrays: bool = False) -> Any:
     return internals.as_part(_compiled(function, cache=True, forceinline=False, **options))
 
 
-def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
+def part(function: Callable[..., Any]) -> Any:
     """Compile a function of arrays to be inlined into compiled routines, which know constants and strides.
 
-    Passing a few dozen arrays may cost more than the work on them. With ``sizes`` the first argument is a number of
-    parameters, and the work is compiled once for each of these sizes, which the compiler then knows, so that it unrolls
-    loops and keeps their data in registers; and once for all others.
+    Passing a few dozen arrays may cost more than the work on them.
     """
-    if function is None:
-        return lambda source: _for_sizes(part(source), sizes)
     return internals.as_part(_compiled(function, cache=True, forceinline=True, **internals.LINKED))
+
+
+def sized(function: Callable[..., Any]) -> Any:
+    """The same, of a function whose first argument is a number of parameters: compiled once for each of 2, 3 and 4,
+    which the compiler then knows, so that it unrolls loops and keeps their data in registers; and once for all others.
+    """
+    return _for_sizes(part(function), (2, 3, 4))
 
 
 def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:

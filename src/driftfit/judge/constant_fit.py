@@ -131,7 +131,8 @@ def _fitted(model: Model, record: Record) -> Array:
     return out
 
 
-def _predicted(rows: Array, known: Array, e: Array) -> None:
+@Driver
+def _predictions(rows: Array, known: Array, e: Array) -> None:
     """Prediction errors e (T,) at the known (T,) samples; the rows [phi, y] (T, k + 1) are overwritten."""
     k = rows.shape[1] - 1
     R, size, theta = np.zeros((k, k + 1)), np.zeros(k), np.zeros(k)
@@ -141,9 +142,6 @@ def _predicted(rows: Array, known: Array, e: Array) -> None:
             for i in range(k):
                 e[t] -= rows[t, i] * theta[i]
             rotate(R, rows[t], size, theta)
-
-
-_predictions = Driver(_predicted)
 
 
 def constant_errors(phi: Array, y: Array, weight: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.bank.layout import tables
-from driftfit.engine.kernel import Array, kernel, log, part, shared
+from driftfit.engine.kernel import Array, kernel, log, part, shared, sized
 from driftfit.engine.simd import (
     WIDTH,
     exp_of,
@@ -73,7 +73,7 @@ def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
         store(X, row, l, only(ratio, load(B, WEIGHT, l)))
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def mixture(n: int, t: Any, L: int) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d'), d = m - mean."""
     B, X, theta, P = t.leaves, t.from_C, t.theta, t.cov

@@ -25,7 +25,7 @@ from driftfit.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply, predicte
 from driftfit.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.bank.leaves.own_sensor import clean_lags, judge_all
-from driftfit.engine.kernel import Array, log, part, shared
+from driftfit.engine.kernel import Array, log, part, shared, sized
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.forms.covariance import LEFT
 
@@ -60,7 +60,7 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
     return K * len(t.walks)
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     """Forecasts of the sample by the parents under all events; returns the number of columns."""
     columns = develop(n, t, K, own)
@@ -69,7 +69,7 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     return int(columns)
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def correct(n: int, t: Any, at: int, columns: int, y: float) -> None:
     """Measurement update of the leaves from column ``at`` on; the last two rows of `scores`, whose last one holds the
     noise variances r_j, receive eps^2 / s and s.

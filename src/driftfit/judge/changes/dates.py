@@ -36,7 +36,8 @@ LEVERAGE = 0.1
 """Smallest share of a residual that its own row is taken to leave."""
 
 
-def _at_each(
+@Driver
+def _profiled(
     X: Array, Z: Array, noise: tuple[Array, Array, Array], place: Array, start: int, least: float, rss: Array,
     theta: Array,
 ) -> None:  # fmt: skip
@@ -49,12 +50,12 @@ def _at_each(
     first = lags[p - 1] if p > 0 else 0
     total, left, passed = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
     G, row, done = np.zeros((k + 1, k + 1)), np.zeros(k + 1), 0
-    add(n + 1, Z, 0, Z.shape[0], total)
-    add(n + 1, Z, 0, first, passed)
+    add(n, Z, 0, Z.shape[0], total)
+    add(n, Z, 0, first, passed)
     for d in range(place.shape[0]):
         at = place[d] - start
-        add(n + 1, Z, done, at, left)
-        add(n + 1, Z, done + first, at + first, passed)
+        add(n, Z, done, at, left)
+        add(n, Z, done + first, at + first, passed)
         done = at
         for i in range(n + 1):
             for j in range(i + 1):
@@ -80,9 +81,6 @@ def _at_each(
             G[i, i] += least
         rss[d] = eliminate(G, k, 0.0)
         solved(G, theta[d])
-
-
-_profiled = Driver(_at_each)
 
 
 def profile(model: Model, ar: Array, breaks: Array, k: int, gap: int) -> tuple[Array, Array, Array]:

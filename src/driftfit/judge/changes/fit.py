@@ -136,6 +136,7 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
+@Driver
 def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
     """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
     last = G.shape[0] - 1
@@ -161,9 +162,6 @@ def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
         chosen[1] = 0
 
 
-_chosen = Driver(_choose)
-
-
 def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
     """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
     Only rows are used that are ``ok`` (N,), as are all their lags."""
@@ -176,7 +174,7 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
         return NONE
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
     rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
-    _chosen(rows.T @ rows, len(at), min(most, longest), found)
+    _choose(rows.T @ rows, len(at), min(most, longest), found)
     lags = np.arange(1, found[0] + 1)
     return np.append(lags, found[1]) if found[1] else lags
 

@@ -58,6 +58,7 @@ class Kind(NamedTuple):
     """Parameters that change; of those that move at dates, a gradual change is of those that it needs."""
 
 
+@Driver
 def _filter(H: Array, steps: Array, columns: Array, scratch: tuple[Array, ...], products: Array, totals: Array) -> None:
     """Of a walk on H (N, J), known at the start, in noise of variance 1, for steps of each variance (S,): sums of
     products (S, c, c) of the innovations of columns (N, c) over their deviation, and the sum of log f to totals."""
@@ -95,15 +96,12 @@ def _filter(H: Array, steps: Array, columns: Array, scratch: tuple[Array, ...], 
                 products[s, d, c] = products[s, c, d]
 
 
-_filtered = Driver(_filter)
-
-
 def innovations(H: Array, steps: Array, columns: Array) -> tuple[Array, Array]:
     """Sums of products (S, c, c) of the innovations of columns (N, c), and the sums (S,) of log f, by steps (S,)."""
     J, c, S = H.shape[1], columns.shape[1], len(steps)
     products, totals = np.zeros((S, c, c)), np.zeros(S)
     scratch = np.zeros((J, c)), np.zeros((J, J)), np.zeros(J), np.zeros(c)
-    _filtered(np.ascontiguousarray(H), steps, columns, scratch, products, totals)
+    _filter(np.ascontiguousarray(H), steps, columns, scratch, products, totals)
     return products, totals
 
 

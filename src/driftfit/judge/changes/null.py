@@ -29,7 +29,7 @@ from driftfit.judge.statistics.robust import SMALL, Basis, Fit, invertible
 
 DRAWS = (19, 39, 79, 199)
 """Draws after which it is decided whether there are more."""
-CLEAR = 5.0
+CLEAR = 10.0
 """Draws beyond the statistic from which on p is known well enough (Besag and Clifford, 1991)."""
 SURE = 1e-4
 """p below which the last draws would change no decision; results print no smaller one."""
@@ -162,7 +162,7 @@ class Draws:
         way = Recursion(
             model.phi, model.basis, *model.lags, theta + model.offset, ar, model.y - model.phi @ theta, self.e
         )  # fmt: skip
-        signs = self.rng.integers(0, 2, (count, len(model.y)), bool) * 2.0 - 1.0
+        signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(
             np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
             np.zeros((count, len(ar))),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from driftfit.engine.kernel import Array, Driver, part, shared
+from driftfit.engine.kernel import Array, Driver, shared, sized
 from driftfit.judge.changes.scan import Found, Problem, Work, search, settle
 
 
@@ -52,7 +52,7 @@ def simulate(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y:
             y[t] += phi[t, j] * way.theta[j]
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def turned(n: int, phi: Array, basis: Array, X: Array) -> None:
     """X (N, n) = phi basis."""
     for t in range(phi.shape[0]):
@@ -75,7 +75,8 @@ class Results(NamedTuple):
     """(R, p)"""
 
 
-def _draw(
+@Driver
+def draw(
     way: Recursion, signs: Array, problem: Problem, whole: int, work: Work, found: Found, results: Results
 ) -> None:
     """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
@@ -99,11 +100,6 @@ def _draw(
             results.theta[d, j] = work.theta[j]
 
 
-draw = Driver(_draw)
-
-
-def _play(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
+@Driver
+def play(way: Recursion, lags: Array, signs: Array, v: Array, phi: Array, y: Array) -> None:
     simulate(way, lags, signs, v, phi, y)
-
-
-play = Driver(_play)

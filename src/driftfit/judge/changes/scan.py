@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver, part, shared
+from driftfit.engine.kernel import Array, Driver, shared, sized
 from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
@@ -115,7 +115,7 @@ class Found(NamedTuple):
         return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), L)
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def whiten(n: int, X: Array, y: Array, g: Array, lags: Array, a: Array, Z: Array) -> None:
     """Z (N, n + 1): rows and outputs after whitening, times g; the rows before the last lag are 0."""
     N, p = X.shape[0], lags.shape[0]
@@ -160,15 +160,15 @@ def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
             work.v[t] -= X[t, j] * work.theta[j]
 
 
-@part(sizes=(3, 4, 5))
-def add(k: int, Z: Array, first: int, last: int, S: Array) -> None:
-    """Add the products of rows first .. last - 1 of Z (N, k) to S, a lower triangle; two at a time take less."""
+@sized
+def add(n: int, Z: Array, first: int, last: int, S: Array) -> None:
+    """Add the products of rows first .. last - 1 of Z (N, n + 1) to S, a lower triangle; two at a time take less."""
     if (last - first) % 2 == 1:
-        for i in range(k):
+        for i in range(n + 1):
             for j in range(i + 1):
                 S[i, j] += Z[first, i] * Z[first, j]
     for t in range(first + (last - first) % 2, last, 2):
-        for i in range(k):
+        for i in range(n + 1):
             for j in range(i + 1):
                 S[i, j] += Z[t, i] * Z[t, j] + Z[t + 1, i] * Z[t + 1, j]
 
@@ -188,10 +188,10 @@ def before(problem: Problem, t: int, work: Work, S: Array) -> None:
     while m + 1 < problem.edges.shape[0] and problem.edges[m + 1] <= t:
         m += 1
     copy(work.C[m], S)
-    add(work.Z.shape[1], work.Z, problem.edges[m], t, S)
+    add(work.Z.shape[1] - 1, work.Z, problem.edges[m], t, S)
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def cost(n: int, first: Array, last: Array, G: Array, least: float) -> float:
     """What n constants leave between two places with these sums before them; their factor is left in G. Information up
     to ``least`` is none."""
@@ -208,7 +208,7 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
     for round in range(ROUNDS):
         whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
         copy(work.C[0], work.G)
-        add(work.Z.shape[1], work.Z, 0, N, work.G)
+        add(work.Z.shape[1] - 1, work.Z, 0, N, work.G)
         rss = eliminate(work.G, X.shape[1], 0.0)
         solved(work.G, work.theta)
         if a.shape[0] == 0:
@@ -226,7 +226,7 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
     edges, m, least = problem.edges, work.cost.shape[0], 0.0
     for j in range(1, m):
         copy(work.C[j - 1], work.C[j])
-        add(work.Z.shape[1], work.Z, edges[j - 1], edges[j], work.C[j])
+        add(work.Z.shape[1] - 1, work.Z, edges[j - 1], edges[j], work.C[j])
     for i in range(X.shape[1]):
         least = max(least, SINGULAR * work.C[m - 1, i, i])
     for j in range(1, m):
@@ -281,7 +281,7 @@ def place(problem: Problem, count: int, work: Work, least: float) -> float:
                 if value < most:
                     most = value
                     at[k] = t
-                add(work.Z.shape[1], work.Z, t, t + by, here)
+                add(work.Z.shape[1] - 1, work.Z, t, t + by, here)
                 t += by
             reach, by = by, 1 if by > 1 else 0
     for k in range(count + 1):
@@ -322,7 +322,7 @@ def form(w: Array, V: Array) -> float:
     return total
 
 
-@part(sizes=(2, 3, 4))
+@sized
 def sums(n: int, Z: Array, theta: Array, S: Array, score: Array, V: Array, M: Array) -> None:
     """V, M (n, n), lower triangles: moments of the scores of constants theta (n,), and of the sums S (n,) of these."""
     for i in range(n):
@@ -392,11 +392,9 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
             keep(problem, count, work, work.next[count], least, found)
 
 
-def _once(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
+@Driver
+def _searched(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
     search(X, y, problem, work, found)
-
-
-_searched = Driver(_once)
 
 
 def searched(X: Array, y: Array, problem: Problem) -> tuple[Found, Work]:
