@@ -230,7 +230,7 @@ CODES = {
         0,
         "no input moves, so only its own",
     ),
-    "text": (["--y", "time", "--time", "speed"], 3, "holds text"),
+    "text": (["--y", "flow", "--u", "time", "--time", "speed"], 3, "time holds text"),
 }
 
 

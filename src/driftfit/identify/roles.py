@@ -127,8 +127,8 @@ def roles(
         if len(left) != 1:
             raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(left)}.")
         y = left[0]
-    if y not in numbers:
-        raise NoAnswerError(f"the output {y} holds text, such as {frame[y][0]!r}; numbers are needed.")
+    if worded := [name for name in (y, *(u or ())) if name not in numbers]:
+        raise NoAnswerError(f"{worded[0]} holds text, such as {frame[worded[0]][0]!r}; numbers are needed.")
     refused, kept = {}, list(u or ())
     for name in {*left, y, *kept} & numbers.keys():
         low, high = (limits or {}).get(name) or (None, None)
