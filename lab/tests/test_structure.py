@@ -6,6 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lab import structure
+from lab.faults import faults
 from lab.program import app
 
 OLD = f"{structure.MOVED}^"
@@ -27,3 +28,8 @@ def test_an_old_revision_has_the_layers_of_what_its_modules_became():
     assert "signals -> trackers.base" not in old.upward  # data may import trackers
     assert {"trackers.bank -> signals", "result -> summary"} <= set(old.upward)
     assert set(old.layers) <= set(old.modules)
+
+
+def test_every_planted_fault_has_its_text_once():
+    sources = structure.ROOT / structure.PACKAGE
+    assert [one.text for one in faults() if (sources / one.module).read_text().count(one.text) != 1] == []
