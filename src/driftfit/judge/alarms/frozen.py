@@ -245,7 +245,11 @@ def _whitened(rows: Array, ok: Array, ar: Array, judged: Array | None = None) ->
 
     With ``judged``, of these rows, of which only some can be lags.
     """
-    at = complete(ok, np.arange(1, len(ar) + 1), judged)
+    p, usable = len(ar), ok if judged is None else judged
+    if not p:
+        return np.flatnonzero(usable), rows[usable]
+    at = np.flatnonzero(usable[p:])
+    at = p + at[np.all([ok[p - lag :][at] for lag in range(1, p + 1)], axis=0)]
     return at, rows[at] - sum(a * rows[at - lag] for lag, a in enumerate(ar, 1))
 
 

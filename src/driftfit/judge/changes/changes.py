@@ -37,8 +37,10 @@ class Changes:
         model, test, (breaks, ar, prices) = self.model, self.test, self.start
         N, n = model.phi.shape
         found = dated(model, breaks, ar, prices, self.dates)
-        none = Which((), (), (), found.theta, found.std[1:], found.rss, n)
+        none = Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
         changed = which(model, found) if len(breaks) else none
+        if (changed.dates != found.breaks).any():
+            found = dated(model, changed.dates, ar, prices, self.dates, final=True)
         moving = tuple(sorted({j for own in changed.at for j in own}))
         if self.rejected and not moving:
             moving = (int(np.argmin(test.p_path[n:])),)

@@ -178,14 +178,16 @@ def shortest_interval(weight: Array, level: float) -> tuple[int, int]:
     return int(best), int(min(last[best], len(weight)) - 1)
 
 
-def dated(model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL) -> Dated:
-    """Dates at full resolution, with their intervals, and the parameters of segments."""
+def dated(
+    model: Model, breaks: Array, ar: Array, prices: tuple[float, float], level: float = LEVEL, final: bool = False
+) -> Dated:
+    """Dates at full resolution, unless they are ``final``, with their intervals, and the parameters of segments."""
     X, y, noise = model.X, model.y, model.noise
     N, n = X.shape
     K, first = len(breaks), order_of(noise.lags)
     gap, spans = noise.fewest, np.zeros((K, 2), np.int64)
     moved = np.zeros((K + 1, n))
-    for _ in range(0 if not K else 2 if len(ar) else 1):
+    for _ in range(0 if final or not K else 2 if len(ar) else 1):
         breaks = settled(model, ar, breaks, gap)
         if len(ar):
             theta, _ = estimated(X, y, (noise.lags, ar, noise.g), breaks)

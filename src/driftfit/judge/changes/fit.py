@@ -74,9 +74,9 @@ def order_of(lags: Array) -> int:
     return int(lags[-1]) if len(lags) else 0
 
 
-def complete(ok: Array, lags: Array, judged: Array | None = None) -> Array:
-    """Indices of the rows that are ``ok`` (N,), or ``judged`` if that is given, and whose lags are all ``ok``."""
-    at = np.flatnonzero(ok if judged is None else judged)
+def complete(ok: Array, lags: Array) -> Array:
+    """Indices of the rows that are ``ok`` (N,), as are all their lags."""
+    at = np.flatnonzero(ok)
     at = at[at >= order_of(lags)]
     return np.asarray(at[ok[at[:, None] - lags].all(axis=1)])
 
