@@ -133,14 +133,10 @@ PIECES: dict[str, Piece] = {
     ),
     "repeated rounding": Piece(
         edits=(
-            (
-                STATES,
-                "return s.repeats[l] * min(share, s.noise[l] * s.r[l]) if s.repeats[l] > 0.0 else 0.0",
-                "return 0.0",
-            ),
-            (STATES, "    if s.repeats[l] > 0.0:\n        return\n", ""),
+            (STATES, "return s.alike[l] * min(", "return 0.0 * min("),
+            (STATES, "    if s.alike[l] > 0.0:\n        return\n", ""),
         ),
-        functions=of(STATES, "note_reading", "repeated_rounding"),
+        functions=of(STATES, "repeated_rounding"),
     ),
     "start with drift": Piece(
         edits=((TRACKER, "    begin_with_drift(s, least_noise(s, l), l)\n", ""),),

@@ -337,8 +337,10 @@ def test_one_file_and_one_folder_lean_on_the_inside_of_numba():
         assert not compilers, f"{path.relative_to(SRC)} uses numba.{compilers}; use the decorators of engine.kernel."
 
 
-def test_the_decorators_are_five():
-    """`kernel`, `shared`, `part`, `machine` and `Driver` are all that compiles."""
+def test_the_decorators_are_six():
+    """`kernel`, `shared`, `part`, `sized`, `machine` and `Driver` are all that compiles."""
     makers = {name for name, value in vars(kernel).items() if callable(value) and value.__module__ == kernel.__name__}
     public = {name for name in makers if not name.startswith("_")}
-    assert public - {"exp", "log", "nothing", "packed"} == {"kernel", "shared", "part", "machine", "Machine", "Driver"}
+    assert public - {"exp", "log", "nothing", "packed"} == {
+        "kernel", "shared", "part", "sized", "machine", "Machine", "Driver",
+    }  # fmt: skip

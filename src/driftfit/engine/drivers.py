@@ -175,7 +175,7 @@ class TrackerSteps(NamedTuple):
     (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
     compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that a
     call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the tracker
-    estimates, which a gate keeps above that of rounding. ``note`` stands in the place of a gate.
+    estimates, which a gate keeps above that of rounding. ``note`` precedes the correction; a gate takes its place.
     """
 
     predict: Step
@@ -331,7 +331,7 @@ def _written(common: bool, store: Any, keep_more: Any, part: Any) -> Any:
 def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record. Between the regression and the lags
     are the ``phases`` of the tracker, one or two, and the gate after the first."""
-    regress, push, notes, judged = model.regress, model.push, note is not nothing and judge is None, judge is not None
+    regress, push, notes, judged = model.regress, model.push, note is not nothing, judge is not None
     first, last, two = phases[0], phases[-1], len(phases) > 1
 
     @kernel

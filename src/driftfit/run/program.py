@@ -21,7 +21,7 @@ from driftfit.data import storage
 from driftfit.data.arguments import check_ready
 from driftfit.data.record import Record
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, nothing
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -160,8 +160,9 @@ class Program:
 
     @cached_property
     def steps(self) -> TrackerSteps:
-        """The compiled steps of the tracker."""
-        return self.tracker.steps_for(self.model)
+        """The compiled steps of the tracker; a gate notes readings in its place."""
+        steps = self.tracker.steps_for(self.model)
+        return steps if self.gate is None else steps._replace(note=nothing)
 
     @property
     def shapes(self) -> tuple[Any, ...]:

@@ -28,7 +28,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import lapack
 
 from driftfit.bank.reduction import Hybrid
 from driftfit.bank.results.events import Event
@@ -273,6 +272,8 @@ def sample(walk: Walk, draws: int, thin: int, burn_in: int, rng: np.random.Gener
 
 def path_of(data: Data, scales: Scales, r: float, rng: np.random.Generator) -> Array:
     """(1) z (M, n) ~ N(P^-1 b, P^-1): with P = L L', z = L'^-1 (L^-1 b + a standard normal vector)."""
+    from scipy.linalg import lapack  # takes longer to import than the rest of the package together
+
     M, n = data.cross.shape
     firm = 1.0 / np.maximum((scales.sizes[0] + scales.jumps) * data.dt, LEAST_MOVE * r)
     P = data.gram / r

@@ -38,7 +38,7 @@ from rich.text import Text
 
 from driftfit.data.arguments import check_ready, check_roles
 from driftfit.data.arrays import columns_as_outputs
-from driftfit.data.record import Reading
+from driftfit.data.record import Reading, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import factor
 from driftfit.judge.plots import plot_selection
@@ -285,12 +285,11 @@ def select(
     columns = [(model, y) if data is None else columns_as_outputs(model, y) for model in candidates]
     candidates, y = [model for model, _ in columns], columns[0][1]
     _, records, _ = records_of(candidates[0], y, u, reading, data, by)
-    bound = [_bound(model, records.labels.u or records.u.shape[-1]) for model in candidates]
     names = [repr(model) for model in candidates]
     if any(len(model.outputs) > 1 for model in candidates):
         if gate:
             raise ValueError("select: gate= is for one output; select for one output after the other.")
-        pools = pools_of(bound, names, y, u, reading, data, by)
+        pools = pools_of(_bound(candidates, records), names, y, u, reading, data, by)
         found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
         return found["rows"] if candidates[0].shared else ByOutput(found)
     if data is None and by is None:
@@ -299,7 +298,7 @@ def select(
         raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
-    gate = tracker.gated if gate is None else gate
+    bound, gate = _bound(candidates, records), tracker.gated if gate is None else gate
     records, left_out = decide(max(bound, key=lambda model: model.n), records, gate)
     union, each = union_of(bound), [replace(records.part(k), time=None) for k in range(len(records.keys))]
     pool, structures = pool_of(bound, names, each, union, union)
@@ -321,17 +320,18 @@ def _selected(
     return _judged(pool, tracker, structures, predictions)
 
 
-def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
-    """A candidate for these inputs; an ARX model of a grid with nb = 0 has no inputs."""
-    m = inputs if isinstance(inputs, int) else len(inputs)
-    if isinstance(model, ARX) and model.inputs == 0 and m > 0:
-        model = replace(model, inputs=m)
-    if not isinstance(inputs, int) and model.input_names not in ((), tuple(inputs)):
-        raise ValueError(
-            f"select: all candidates must name the same inputs in the same order; {model!r} does not have "
-            f"{', '.join(inputs)}."
-        )
-    return model.bind(inputs)
+def _bound(models: Sequence[Model], records: Records) -> list[Model]:
+    """The candidates for the inputs of the records; an ARX model of a grid with nb = 0 has no inputs."""
+    inputs, m, bound = records.labels.u, records.u.shape[-1], []
+    for model in models:
+        if inputs and model.input_names not in ((), tuple(inputs)):
+            raise ValueError(
+                f"select: all candidates must name the same inputs in the same order; {model!r} does not have "
+                f"{', '.join(inputs)}."
+            )
+        whole = replace(model, inputs=m) if isinstance(model, ARX) and model.inputs == 0 and m > 0 else model
+        bound.append(whole.bind(inputs or m))
+    return bound
 
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictions: list[Predicted]) -> Selection:
