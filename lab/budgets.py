@@ -28,12 +28,12 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_701,
-    "statements": 43_275,
+    "lines of the library": 66_751,
+    "statements": 43_315,
     "modules": 326,
     "levels of folders": 2,
-    "constants of modules with numbers": 623,
-    "numbers in the source": 2_382,
+    "constants of modules with numbers": 624,
+    "numbers in the source": 2_384,
     "private names of Numba and llvmlite": 27,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_208,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 32,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 11_832,
-    "lines of tests": 33_568,
+    "lines of tests": 33_576,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
