@@ -84,6 +84,7 @@ def density(e: Array) -> Array:
     return np.where(known & (count > LEAST), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
 
 
+@Driver
 def _weigh(ratio: Array, weight: Array) -> None:
     """`weights` (T,) from the ratios (T,) of both densities."""
     now = 0.5
@@ -92,14 +93,11 @@ def _weigh(ratio: Array, weight: Array) -> None:
         now = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after)
 
 
-_weighed = Driver(_weigh)
-
-
 def weights(first: Array, second: Array) -> Array:
     """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,) (Herbster and
     Warmuth, 1998)."""
     weight = np.empty(len(first))
-    _weighed(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)), weight)
+    _weigh(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)), weight)
     return weight
 
 

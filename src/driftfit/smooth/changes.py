@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -31,30 +30,23 @@ def changes(run: Track, threshold: float) -> list[Event]:
     joined = np.array([[label == name for name in names[1:]] for label in labels], float)
     found = found._replace(events=np.column_stack([found.events[:, :1], found.events[:, 1:] @ joined]))
     found = found.turned(walk.basis) if len(walk.basis) else found
-    return dated(run, found, np.full((len(run), 1), 1.0 - PER_SAMPLE), names, threshold, Hybrid.remembered, [])
-
-
-class Moves(Protocol):
-    """What is known of the moves of a path."""
-
-    @property
-    def events(self) -> Array:
-        """(T, E): probabilities of the events before each sample, none of them first."""
-
-    def increment(self, first: int, last: int) -> tuple[Array, Array]:
-        """Mean and standard deviation (n,) of how far theta moved at these samples."""
+    prior = np.full((len(run), 1), 1.0 - PER_SAMPLE)
+    return dated(run, found.events, found.increment, prior, names, threshold, Hybrid.remembered, [])
 
 
 def dated(
-    run: Track, found: Moves, prior: Array, names: Sequence[str], threshold: float, W: int, known: Sequence[Span]
-) -> list[Event]:
+    run: Track, probable: Array, increment: Callable[[int, int], tuple[Array, Array]], prior: Array,
+    names: Sequence[str], threshold: float, W: int, known: Sequence[Span],
+) -> list[Event]:  # fmt: skip
     """Changes more probable than the threshold within W samples, with credible sets of dates, sizes, and times.
 
+    ``probable`` (T, E) are the probabilities of the events before each sample, none of them first, ``increment`` is the
+    mean and standard deviation (n,) of how far theta moved from a first to a last sample.
     ``prior`` (T, 1) is the probability of no event before the record is seen, ``names`` are those of the events, and
     ``known`` what a filter found, each with the sample at which it did.
     """
     last, used = len(run) - 1, run.ok
-    p, before = gathered(found.events, used), gathered(np.column_stack([prior, 1.0 - prior]), used)
+    p, before = gathered(probable, used), gathered(np.column_stack([prior, 1.0 - prior]), used)
     # no more likely than before the record was seen: at the end of a record, say
     p = np.where(p[:, :1] < before[:, :1], p, np.eye(1, p.shape[1]))
     total = np.r_[np.zeros(W), np.cumsum(1.0 - p[:, 0])]
@@ -64,7 +56,7 @@ def dated(
         first, final = event.span.first, event.span.last
         when = [span.known for span in known if first - W < span.date < final + W and span.known >= first]
         span = event.span._replace(known=min(when, default=last))
-        sized = replace(event, span=span, level=LEVEL).measured(run.names, *found.increment(first, final))
+        sized = replace(event, span=span, level=LEVEL).measured(run.names, *increment(first, final))
         events.append(sized.timed(lambda sample: run.time[sample]))
     return events
 

@@ -53,34 +53,19 @@ WEAK = 1e3
 
 
 class Sampled(NamedTuple):
-    """Draws of the path of a record with M instants and n parameters."""
+    """Draws of a record with M instants and n parameters: ``theta`` and ``jumps``, the second part of w, both
+    (K, M, n); ``effect`` (K, n), sum of weight_t (phi_jt (theta_jt - its mean))^2; ``r`` (K,)."""
 
     theta: Array
-    """(K, M, n)"""
     jumps: Array
-    """(K, M, n): the second part of w; 0 at the first instant."""
     effect: Array
-    """(K, n): sum of weight_t (phi_jt (theta_jt - its mean))^2."""
     r: Array
-    """(K,)"""
 
     def at(self, opens: Array, ny: int) -> Sampled:
         """The same at each sample, given which of its rows begin an instant."""
         opens = np.append(True, opens[1:])
         new, of = opens[::ny], (np.cumsum(opens) - 1)[::ny]
         return self._replace(theta=self.theta[:, of], jumps=np.where(new[:, None], self.jumps[:, of], 0.0))
-
-
-class JumpsOfOne(NamedTuple):
-    """The probabilities of jumps of one parameter, with what `dated` asks of it."""
-
-    events: Array
-    theta: Array
-
-    def increment(self, first: int, last: int) -> tuple[Array, Array]:
-        """Mean and standard deviation (n,) of how far theta moved at these instants."""
-        moved = self.theta[:, last] - self.theta[:, max(first - 1, 0)]
-        return moved.mean(axis=0), moved.std(axis=0)
 
 
 class Shrunk(Printed):
@@ -127,9 +112,13 @@ class Shrunk(Printed):
         """The jumps of each parameter with dates, intervals and sizes, as `Track.events`; walks have none."""
         found: list[Event] = []
         for p, name in zip(self.jumps.T, self.names, strict=True):
-            one = JumpsOfOne(np.column_stack([1.0 - p, p]), self.draws)
-            found += dated(self.run, one, np.ones((len(p), 1)), ("none", name), threshold, Hybrid.remembered, [])
+            probable, none = np.column_stack([1.0 - p, p]), np.ones((len(p), 1))
+            found += dated(self.run, probable, self._increment, none, ("none", name), threshold, Hybrid.remembered, [])
         return sorted(found, key=lambda event: event.span.date)
+
+    def _increment(self, first: int, last: int) -> tuple[Array, Array]:
+        moved = self.draws[:, last] - self.draws[:, max(first - 1, 0)]
+        return moved.mean(axis=0), moved.std(axis=0)
 
     def __rich__(self) -> Table:
         """Where each parameter begins and ends, its share in what moves, with a 95 % interval, and its jumps."""
@@ -181,24 +170,22 @@ def local_shrinkage(
 
 
 class Data(NamedTuple):
-    """A record by instant, about constant least squares and in units in which regressors have size 1."""
+    """A record by instant, about constant least squares and in units in which regressors X (N, n) have size 1.
+
+    ``at`` (N,) is the instant of each row, of which there are M, with intervals ``dt`` (M - 1, 1) between them;
+    ``gram`` (M, n, n + 1) sums weight x x' of the rows of each, entry (i, k) that of (i + k, i); ``cross`` (M, n) sums
+    weight x y. ``weak`` is the precision of theta_0, whose mean is 0, and ``least`` the least noise variance.
+    """
 
     X: Array
-    """(N, n): regressors of root mean square 1."""
     y: Array
     weight: Array
     at: Array
-    """(N,): the instant of each row, of which there are M."""
     dt: Array
-    """(M - 1, 1): intervals between instants."""
     gram: Array
-    """(M, n, n + 1): sum of weight x x' of the rows of each instant; entry (i, k) is that of (i + k, i)."""
     cross: Array
-    """(M, n): sum of weight x y."""
     weak: float
-    """Precision of theta_0, which has mean 0."""
     least: float
-    """Least noise variance."""
 
     @classmethod
     def of(cls, walk: Walk, X: Array, y: Array) -> Data:
