@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_737,
-    "statements": 43_292,
+    "lines of the library": 66_729,
+    "statements": 43_293,
     "modules": 326,
     "levels of folders": 2,
     "constants of modules with numbers": 624,

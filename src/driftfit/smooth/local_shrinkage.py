@@ -112,8 +112,8 @@ class Shrunk(Printed):
         """The jumps of each parameter with dates, intervals and sizes, as `Track.events`; walks have none."""
         found: list[Event] = []
         for p, name in zip(self.jumps.T, self.names, strict=True):
-            probable, none = np.column_stack([1.0 - p, p]), np.ones((len(p), 1))
-            found += dated(self.run, probable, self._increment, none, ("none", name), threshold, Hybrid.remembered, [])
+            p, none, W = np.column_stack([1.0 - p, p]), np.ones((len(p), 1)), Hybrid.remembered
+            found += dated(self.run, p, self._increment, none, ("none", name), threshold, W, [])
         return sorted(found, key=lambda event: event.span.date)
 
     def _increment(self, first: int, last: int) -> tuple[Array, Array]:

@@ -180,16 +180,8 @@ class Hypotheses:
         faults, known = ([event for event in found if event.kind == kind] for kind in ("sensor", "change"))
         smoothed, names, W = self.smoothed, self.tracker.change_names, self.lags[-1] + 1
         spans = [event.span for event in known]
-        changes = dated(
-            self.run,
-            smoothed.mixture.events,
-            smoothed.mixture.increment,
-            smoothed.prior[:, :1],
-            names,
-            threshold,
-            W,
-            spans,
-        )
+        path, prior = smoothed.mixture, smoothed.prior[:, :1]
+        changes = dated(self.run, path.events, path.increment, prior, names, threshold, W, spans)
         return sorted(faults + changes, key=lambda event: event.span.date)
 
     def changes(self, threshold: float = 0.5) -> list[Event]:
