@@ -92,13 +92,13 @@ class Gate(Settings):
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
 
-def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
-    """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
+def start(gate: Gate, n: int, m: int, shifts: bool = False) -> Mapping[str, Any]:
+    """Fields of the gate's state before the first sample, for n parameters and m inputs (`no_samples`)."""
     return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
         "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
         "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0,
-        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m),
+        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m, shifts),
     }  # fmt: skip
 
 

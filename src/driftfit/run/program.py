@@ -145,7 +145,7 @@ class Program:
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         if self.gate is None:
             return own
-        begun = gate_start(self.gate, self.model.n, self.model.m)
+        begun = gate_start(self.gate, self.model.n, self.model.m, self.model.linearised is not None)
         return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
 
     @property
