@@ -143,3 +143,41 @@ def test_a_start_between_two_levels_of_a_coarse_meter_has_no_fault_codes(tracker
     assert run.ok.all()
     assert left_out(run) == 0
     assert run.innovation_std[-1] > 0.2 * unit
+
+
+EACH = {"y1": Kalman(q=1e-6, r=0.01), "y2": Kalman(q=1e-5, r=0.02, p0=10.0)}
+
+
+@pytest.mark.parametrize("tracker", [EACH, AdaptiveKalman()], ids=["Kalman", "AdaptiveKalman"])
+@pytest.mark.parametrize("model", [ARX(1, 1, ny=2), Regression(1, ny=2)], ids=["lags", "none"])
+def test_codes_of_several_outputs_are_those_of_gaps(tmp_path, model, tracker):
+    """A code in one output is a lag of the others: all are run again, and a stream and a file say the same."""
+    rng = np.random.default_rng(0)
+    u, noise = rng.normal(size=200), 0.1 * rng.normal(size=(200, 2))
+    y, moved = np.outer(u, [1.0, 0.5]) + noise, np.outer(np.r_[0.0, u[:-1]], [1.0, 0.5]) + noise
+    for t in range(1, 200 if isinstance(model, ARX) else 0):
+        y[t] = np.array([[0.7, 0.2], [-0.3, 0.5]]) @ y[t - 1] + moved[t]
+    codes, gaps, strange, unknown = y.copy(), y.copy(), u.copy(), u.copy()
+    codes[3, 1], codes[7:9, 0], strange[5] = 9999.0, -999.0, 1e6
+    gaps[3, 1], gaps[7:9, 0], unknown[5] = np.nan, np.nan, np.nan
+    run, clean = (track(model, tracker, *signals, gate=True) for signals in ((codes, strange), (gaps, unknown)))
+    live = Live(model, tracker, gate=True)
+    for one in zip(codes, strange, strict=True):
+        live.update(*one)
+    run.save(tmp_path / "run.zip")
+    np.testing.assert_array_equal(run.theta[30:], clean.theta[30:])
+    np.testing.assert_array_equal(live.theta, run.theta[-1])
+    assert live.left_out.counts == {"Left out at the start": 5}
+    for found in (run, type(run).load(tmp_path / "run.zip")):
+        assert [found[name].left_out.sample.tolist() for name in run.outputs] == [[5, 7, 8], [3, 5]]
+        assert found.loglik == pytest.approx(clean.loglik, rel=1e-12)
+        np.testing.assert_array_equal(found["y1"].smooth().theta, clean["y1"].smooth().theta)
+
+
+def test_each_series_of_a_fleet_begins_again_with_its_own_settings():
+    y, u = plant()
+    y[[4, 9]] = 9999.0
+    settings = [Kalman(q=1e-6, r=0.01, p0=1.0), Kalman(q=1e-2, r=1.0, p0=3.0)]
+    fleet = track(PLANT, settings, np.stack([y, y]), np.stack([u, u])[..., None], by="row", gate=True)
+    for k, tracker in enumerate(settings):
+        np.testing.assert_array_equal(fleet[k].theta, track(PLANT, tracker, y, u, gate=True).theta)

@@ -18,7 +18,8 @@ least squares on the others only q with nu residuals, and with k doubtful sample
     nu (Q - q) > WORSE k q
 
 Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
-the state before the first sample and replays whole samples without the codes, once.
+the state before the first sample and replays whole samples without the codes, once. Several outputs are kept together,
+each is judged by its own regression, and the samples are replayed without the codes of all.
 
 Source: the test is Chow's (1960), the median deviation as a scale Hampel's (1974), the recursive QR decomposition
 Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
@@ -26,7 +27,7 @@ Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -68,11 +69,11 @@ def present(s: State, column: int, l: int) -> float:
     if column < U:
         factor = s.dt[l] if column == DT else s.noise[l] if column == NOISE else s.drift[l]
         reading = s.raw_y[l] if s.observed[l] > 0.0 else np.nan  # as it was measured
-        return reading if column == READING else factor  # type: ignore[no-any-return]
+        return reading if column == READING else factor
     if column < PHI:
         return s.u[column - U, l]  # type: ignore[no-any-return]
     phi = s.phi[min(column - PHI, s.phi.shape[0] - 1), l] if s.valid[l] > 0.0 else np.nan
-    return phi if column < PHI + s.phi.shape[0] else s.shift[l]  # type: ignore[no-any-return]
+    return phi if column < PHI + s.phi.shape[0] else s.shift[l]
 
 
 @kernel
@@ -101,12 +102,12 @@ def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> fl
     return 0.0 if apart else np.nan
 
 
-@kernel
-def judge_each(s: State, implicit: bool, l: int) -> bool:
-    """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0; whether there is such a one."""
+@partial(kernel, short=True)
+def judge_each(s: State, implicit: bool, l: int) -> None:
+    """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0."""
     N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], U + s.u.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, some = OUTLYING * usual_value(s, READING, center, True, l), False
+    most = OUTLYING * usual_value(s, READING, center, True, l)
     for k in range(N):
         s.gate_doubt[k, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
@@ -119,8 +120,6 @@ def judge_each(s: State, implicit: bool, l: int) -> bool:
                 s.gate_doubt[k, l] = d + 2.0
     for k in range(N):
         s.gate_doubt[k, l] = s.gate_doubt[k, l] if s.gate_doubt[k, l] < 3.0 else 0.0
-        some |= s.gate_doubt[k, l] > 0.0
-    return some
 
 
 @kernel
@@ -169,11 +168,13 @@ def contradicted(s: State, l: int) -> bool:
     return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
-@kernel
-def mark(s: State, ages: int, l: int) -> None:
-    """The signals that made samples doubtful, as bits in the last column: 1 for the output, 2, 4, .. for inputs."""
-    N, last, bit = s.gate_first.shape[0], s.gate_first.shape[1] - 1, 2.0
+@partial(kernel, short=True)
+def mark(s: State, ages: int, l: int) -> bool:
+    """The signals that made samples doubtful, as bits in the last column: 1 for the output, 2, 4, .. for inputs; none
+    if the others do not contradict them."""
+    N, last, bit, found = s.gate_first.shape[0], s.gate_first.shape[1] - 1, 2.0, contradicted(s, l)
     for k in range(N):
+        s.gate_doubt[k, l] = s.gate_doubt[k, l] if found else 0.0
         s.gate_first[k, last, l] = 1.0 if s.gate_doubt[k, l] == 1.0 else 0.0
     for j in range(s.u.shape[0]):
         center = usual_value(s, U + j, 0.0, False, l)
@@ -185,68 +186,52 @@ def mark(s: State, ages: int, l: int) -> None:
             outside = abs(s.gate_first[k, U + j, l] - center) > most
             s.gate_first[k, last, l] += hit if outside else 0.0
         bit *= 2.0
+    return found  # type: ignore[no-any-return]
 
 
 @kernel
-def beginning(s: State, l: int) -> int:
-    """With how many equal readings the samples begin."""
-    N, equal = s.gate_first.shape[0], 1
-    while (equal < N) and (s.gate_first[equal, READING, l] == s.gate_first[0, READING, l]):
+def enough(s: State, l: int) -> bool:
+    """Whether the output moved: its readings do not begin with so many equal ones that they are half of all."""
+    N, first, equal = s.gate_first.shape[0], s.gate_first[0, READING, l], 1
+    while (equal < N) and (s.gate_first[equal, READING, l] == first):
         equal += 1
-    return equal
-
-
-@kernel
-def comes_again(s: State, l: int) -> bool:
-    """Whether the reading of the beginning comes again: a rest does, codes of a start are over."""
-    again = False
-    for k in range(beginning(s, l), s.gate_first.shape[0]):
-        again |= s.gate_first[k, READING, l] == s.gate_first[0, READING, l]
-    return again
+    return (first == first) & ((equal == 1) | (2 * (equal + s.phi.shape[0]) < N))  # type: ignore[no-any-return]
 
 
 @partial(kernel, short=True)
-def decide(s: State, ages: int, implicit: bool, l: int) -> None:
+def decide(s: State, ages: int, implicit: bool) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
-    dropped, s.gate_decided[l] = -s.gate_decided[l], 1
-    some = judge_each(s, implicit, l)
-    whole = (dropped == 0) | (s.gate_doubt[0, l] == 1.0) & (not comes_again(s, l))
-    if some & whole and contradicted(s, l):
-        mark(s, ages, l)
-        s.gate_replay[l] = 1 + dropped
+    dropped, whole, found = -s.gate_decided[0], True, False
+    for l in range(s.gate_decided.shape[0]):
+        judge_each(s, implicit, l)
+        whole &= (dropped == 0) | (s.gate_doubt[0, l] == 1.0)
+    for l in range(s.gate_decided.shape[0]):
+        found |= mark(s, ages, l) & whole
+    for l in range(s.gate_decided.shape[0]):
+        s.gate_decided[l], s.gate_replay[l] = 1, 1 + dropped if found else 0
 
 
 @partial(kernel, short=True)
-def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
-    N, width = s.gate_first.shape[0], s.gate_first.shape[1]
-    last, again = max(s.gate_kept[l] - 1, 0), s.gate_kept[l] > 0
-    for column in range(READING, width):
-        again &= present(s, column, l) == s.gate_first[last, column, l]
-    if again:
-        s.gate_first[last, TIMES, l] += 1.0
-        return
-    if s.gate_kept[l] == N:
-        known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-        s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
-        for k in range(1, N):  # the oldest makes room
-            for column in range(width):
-                s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-    else:
-        s.gate_kept[l] += 1
-    for column in range(width):
-        s.gate_first[s.gate_kept[l] - 1, column, l] = present(s, column, l) if column > TIMES else 1.0
-    known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-    equal = beginning(s, l) if (s.gate_kept[l] == N) & known else N
-    if (equal == 1) | (2 * (equal + s.phi.shape[0]) < N):
-        decide(s, ages, implicit, l)
-
-
-def first_samples(implicit: bool) -> Callable[[State, int, int], None]:
-    """``remember(s, ages, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
-
-    @kernel
-    def remember(s: State, ages: int, l: int) -> None:
-        if s.gate_decided[l] < 1:
-            remember_one(s, ages, implicit, l)
-
-    return remember  # type: ignore[no-any-return]
+def remember(s: State, ages: int, implicit: bool) -> None:
+    """Keep the sample, of all outputs, and decide once one of them moved; inputs stay for ``ages`` samples."""
+    N, width, L = s.gate_first.shape
+    last, again, known, moved = max(s.gate_kept[0] - 1, 0), s.gate_kept[0] > 0, False, False
+    for l in range(L):
+        known |= s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
+        for column in range(READING, width):
+            again &= present(s, column, l) == s.gate_first[last, column, l]
+    full = (s.gate_kept[0] == N) & (not again)
+    last = last if again | full else s.gate_kept[0]
+    for l in range(L):
+        if full:
+            s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
+            for k in range(1, N):  # the oldest makes room
+                for column in range(width):
+                    s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
+        s.gate_kept[l] = last + 1
+        s.gate_first[last, TIMES, l] = s.gate_first[last, TIMES, l] + 1.0 if again else 1.0
+        for column in range(READING, width):
+            s.gate_first[last, column, l] = present(s, column, l)
+        moved |= (last + 1 == N) & enough(s, l)
+    if moved:
+        decide(s, ages, implicit)
