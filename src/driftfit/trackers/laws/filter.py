@@ -78,7 +78,7 @@ def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, flo
     shown = (table[OWNER] == np.arange(n)[:, None]) * table[VISIBLE]
     return {
         "theta": shown @ x, "P": shown @ C @ shown.T, "law": table, "x": x, "C": C, "A": np.diag(free),
-        "R": np.zeros((N, N)), "z": np.zeros(N), "free": free,
+        "triangle": np.zeros((N, N)), "z": np.zeros(N), "free": free,
         "work": np.zeros((WORK, N)), "known": 0.0, "reached": 0.0, "total": 0.0, "drift_root": np.ones(n),
         "F": np.ones(N),
     }  # fmt: skip
@@ -268,7 +268,7 @@ def forecast(s: State, l: int) -> None:
 @kernel
 def correct(s: State, l: int) -> None:
     """The correction, and what is shown of it."""
-    x, C, A, R, z, work = s.x[:, l], s.C[:, :, l], s.A[:, :, l], s.R[:, :, l], s.z[:, l], s.work[:, :, l]
+    x, C, A, R, z, work = s.x[:, l], s.C[:, :, l], s.A[:, :, l], s.triangle[:, :, l], s.z[:, l], s.work[:, :, l]
     v, N = s.known[l] + s.r[l] * s.noise[l], s.x.shape[0]
     informs = (s.reached[l] > 0.0) & (s.ok[l] > 0.0)
     if informs:
