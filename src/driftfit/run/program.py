@@ -339,9 +339,9 @@ class Program:
         the cache.
         """
         keep, rows = _driven(tile.dtype, self.outputs, out.dtype)
-        run, last = self.drivers(keep).run, ()
+        run, last = self.drivers(keep).run, list[Array]()
         if out.dtype.names == ("theta",):  # the driver writes theta, and the rest of a sample over that of the last one
-            last, out, rows = (np.empty(1, rows),), out["theta"], rows["theta"]
+            last, out, rows = [np.empty(1, rows)], out["theta"], rows["theta"]
         if out.dtype == rows.base:
             run(tile, y, u, known, *last, out)
             return
