@@ -97,6 +97,23 @@ def start(gate: Gate, n: int, m: int, shifts: bool = False) -> Mapping[str, Any]
     }  # fmt: skip
 
 
+@kernel
+def learn(s: State, seen: bool, contradicts: bool, own: float, most: float, l: int) -> None:
+    """Mean and variance of the readings, and the mean of e^2 / own, e^2 at ``most`` that, of the samples used."""
+    known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
+    s.gate_count[l] += 1.0 if seen else 0.0
+    share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
+    if seen:
+        off = measured(s, l) - s.gate_mean[l]
+        if contradicts & known:
+            clip = np.sqrt(CLIPPED * spread)
+            off = min(max(off, -clip), clip)
+        s.gate_mean[l] += share * off
+        s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
+    if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
+        s.gate_ratio[l] += share * (min(s.e[l] * s.e[l], most) / own - s.gate_ratio[l])
+
+
 def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
@@ -166,24 +183,6 @@ def gate_step(
     far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
 
     @kernel
-    def learn(s: State, seen: bool, contradicts: bool, own: float, v: float, l: int) -> None:
-        """Mean and variance of the readings, and the mean of e^2 / own of the samples used."""
-        known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
-        s.gate_count[l] += 1.0 if seen else 0.0
-        share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
-        if seen:
-            off = measured(s, l) - s.gate_mean[l]
-            if contradicts & known:
-                most = np.sqrt(CLIPPED * spread)
-                off = min(max(off, -most), most)
-            s.gate_mean[l] += share * off
-            s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
-        if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-            # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
-            e2 = min(s.e[l] * s.e[l], np.inf if lends & (not known) else sure * v)
-            s.gate_ratio[l] += share * (e2 / own - s.gate_ratio[l])
-
-    @kernel
     def step(s: State, l: int) -> None:
         ages, s.reason[l] = s.reason[l], USED
         s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
@@ -205,7 +204,9 @@ def gate_step(
                 contradicts = judge(s, v, l)
         resolve(s, l)
         s.reading[l] = measured(s, l) if seen else s.reading[l]
-        learn(s, seen, contradicts, own, v, l)
+        # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
+        most = np.inf if lends & (s.gate_count[l] < FIRST) else sure * v
+        learn(s, seen, contradicts, own, most, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
     @partial(kernel, inline=False)
