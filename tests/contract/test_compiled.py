@@ -2,6 +2,7 @@
 compile_notice.
 """
 
+import ast
 import gc
 import os
 import pty
@@ -334,3 +335,38 @@ def test_a_write_that_is_interrupted_leaves_no_file(own_cache, monkeypatch):
             Driver(second)(np.ones((2, 2)))
     assert list(own_cache.iterdir()) == []
     assert Driver(second)(np.ones((2, 2))) == 1.0
+
+
+def stray(source):
+    """Functions that do more with the address of what they pack than call a routine."""
+    found = []
+    for function in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)):
+        inside = list(ast.walk(function))
+        packing = [one for one in inside if isinstance(one, ast.Call) and getattr(one.func, "id", "") == "packed"]
+        kept = [one for one in inside if isinstance(one, ast.Assign) and one.value in packing and len(one.targets) == 1]
+        names = {getattr(one.targets[0], "id", None) for one in kept}
+        calls = [one.value for one in inside if isinstance(one, ast.Expr) and isinstance(one.value, ast.Call)]
+        machines = [one for one in calls if getattr(one.func, "id", "").startswith("machine")]
+        given = [argument for one in machines for argument in one.args]
+        used = [
+            one for one in inside if isinstance(one, ast.Name) and one.id in names and isinstance(one.ctx, ast.Load)
+        ]
+        if len(kept) != len(packing) or not all(one in given for one in used):
+            found.append(function.name)
+    return found
+
+
+def test_an_address_on_the_stack_stays_in_its_function():
+    """What a function packs is gone when it returns."""
+    sources = {path.name: path.read_text() for path in (SRC / "driftfit").rglob("*.py")}
+    users = [
+        name
+        for name, text in sources.items()
+        for one in ast.walk(ast.parse(text))
+        if isinstance(one, ast.ImportFrom) and one.module == "driftfit.engine.kernel" and "packed" in ast.unparse(one)
+    ]
+    assert {"diffuse.py"} <= set(users)
+    assert {name: stray(sources[name]) for name in users} == {name: [] for name in users}
+    right = "def f(s):\n    at = packed((1, 2))\n    machine_f(at, 3)\n"
+    for line in ("return at", "s.kept = at", "later(at)"):
+        assert stray(f"{right}    {line}\n") == ["f"]

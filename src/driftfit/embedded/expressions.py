@@ -266,7 +266,9 @@ class Expressions:
         arguments = [plain(self.value(one)) for one in node.args]
         if function in (tracker_part, whole_record):
             return arguments[0]  # in C there is one record
-        if function in (kernel.floats, kernel.cubes):
+        if function is kernel.packed or (function is kernel.wholes and arguments[0].kind == "items"):
+            return arguments[0]  # C passes addresses one by one
+        if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
         if hasattr(function, "py_func"):
             return self.called(function.py_func, arguments, statement)

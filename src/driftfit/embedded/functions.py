@@ -279,6 +279,10 @@ class Body(Statements):
             elif one.kind == "address":
                 self.parameters.append(f"real *{name}")
                 named[argument.arg] = renamed(one, name)
+            elif one.kind == "items":
+                own = [renamed(item, f"{name}{k}") for k, item in enumerate(one.constant)]
+                self.parameters += [f"real *{item.text}" for item in own]
+                named[argument.arg] = Value("items", constant=own)
             elif one.known and one.kind != "real":
                 named[argument.arg] = one
             elif one.kind in RANK:
@@ -355,6 +359,8 @@ def _passed(value: Value) -> str:
         return "s, scratch"
     if value.kind in ("array", "address"):
         return begin_of(value)
+    if value.kind == "items":
+        return ", ".join(begin_of(item) for item in value.constant)
     return "" if value.known and value.kind != "real" else value.text
 
 

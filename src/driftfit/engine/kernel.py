@@ -339,6 +339,30 @@ floats = internals.array_of("floats", 2, types.float64)
 """floats(address, rows, columns): the array (rows, columns) of floats that begins at an address."""
 cubes = internals.array_of("cubes", 3, types.float64)
 """cubes(address, rows, columns, lanes): the array (rows, columns, lanes) of floats that begins at an address."""
+wholes = internals.array_of("wholes", 2, types.int64)
+"""wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
+
+
+def _in_a_row(context: Any, numbers: Any) -> Any:
+    """The typed half of `packed`."""
+    word, index = internals.ir.IntType(64), internals.ir.IntType(32)
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        with builder.goto_entry_block():
+            place = builder.alloca(internals.ir.ArrayType(word, len(numbers)))
+        for k, kind in enumerate(numbers):
+            value = context.cast(builder, builder.extract_value(given[0], k), kind, types.intp)
+            builder.store(value, builder.gep(place, [index(0), index(k)], inbounds=True))
+        return builder.ptrtoint(place, word)
+
+    return types.intp(numbers), build
+
+
+packed = internals.named_intrinsic("packed", _in_a_row)
+"""packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine.
+
+It holds until the function that packs them returns, so the routine must be called in the same function.
+"""
 
 
 @kernel

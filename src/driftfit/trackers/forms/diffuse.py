@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, in_units_of_noise
-from driftfit.engine.kernel import Array, State, Step, cubes, exp, floats, kernel, log, machine, shared
+from driftfit.engine.kernel import Array, State, Step, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
 from driftfit.trackers.forms.covariance import LEFT, prediction
 from driftfit.trackers.forms.information import spread
 
@@ -56,6 +56,10 @@ Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
 variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation, and
 the column by which a regressor enters.
 """
+
+AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = range(10)
+"""Addresses that `machine_learn` is given."""
+
 
 KNOWN = 1e150
 """Root of the information on a parameter that is known for certain: its square is finite, and its inverse's is not."""
@@ -297,25 +301,24 @@ def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
 
 
 @partial(machine, short=True)
-def machine_foresee(S: int, R: int, phi: int, work: int, now: int, n: int, L: int, l: int) -> None:
+def machine_foresee(fields: int, n: int, L: int, l: int) -> None:
     """`foresee` for lane l of L, from the addresses of fields."""
-    foresee(
-        cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], floats(phi, n, L)[:, l],
-        cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l],
-    )  # fmt: skip
+    at = wholes(fields, 1, ADDRESSES)
+    S, R, phi = cubes(at[0, AT_S], n, n, L), cubes(at[0, AT_R], n, n, L), floats(at[0, AT_PHI], n, L)
+    work, now = cubes(at[0, AT_WORK], WORK, n, L), floats(at[0, AT_NOW], NOW, L)
+    foresee(S[:, :, l], R[:, :, l], phi[:, l], work[:, :, l], now[:, l])
 
 
 @partial(machine, short=True)
-def machine_learn(
-    S: int, d: int, R: int, P: int, theta: int, phi: int, work: int, now: int, var: int, n: int, m: int, L: int, l: int
-) -> None:
+def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
-    S_l, R_l, P_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], cubes(P, n, n, L)[:, :, l]
-    learn(
-        S_l, floats(d, n, L)[:, l], R_l, P_l, floats(theta, n, L)[:, l], floats(phi, n, L)[:, l],
-        cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l],
-    )  # fmt: skip
-    spanned(S_l, R_l, P_l, floats(var, m, L)[:, l])
+    at = wholes(fields, 1, ADDRESSES)
+    S, R, P = cubes(at[0, AT_S], n, n, L), cubes(at[0, AT_R], n, n, L), cubes(at[0, AT_P], n, n, L)
+    S_l, R_l, P_l = S[:, :, l], R[:, :, l], P[:, :, l]
+    d, theta, phi = floats(at[0, AT_D], n, L), floats(at[0, AT_THETA], n, L), floats(at[0, AT_PHI], n, L)
+    work, now = cubes(at[0, AT_WORK], WORK, n, L), floats(at[0, AT_NOW], NOW, L)
+    learn(S_l, d[:, l], R_l, P_l, theta[:, l], phi[:, l], work[:, :, l], now[:, l])
+    spanned(S_l, R_l, P_l, floats(at[0, AT_VAR], m, L)[:, l])
 
 
 @shared
@@ -388,10 +391,14 @@ def drifted(s: State, time: float, l: int) -> None:
 
 
 @kernel
-def foresee_row(s: State, phi: int, l: int) -> None:
-    """`foresee` from a regressor at this address: |S^-T phi|^2, inf in a new direction."""
+def foresee_row(s: State, theta: int, phi: int, l: int) -> None:
+    """`foresee` from parameters and regressors at these addresses: |S^-T phi|^2, inf in a new direction."""
     n, L = s.d.shape
-    machine_foresee(s.S.ctypes.data, s.R.ctypes.data, phi, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
+    fields = packed((
+        s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
+        s.at_start.ctypes.data, s.var.ctypes.data,
+    ))  # fmt: skip
+    machine_foresee(fields, n, L, l)
 
 
 @kernel
@@ -399,10 +406,11 @@ def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
     """`learn` from parameters and regressors at these addresses, with the sample if ok is 1."""
     n, L = s.d.shape
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[AGE, l] = s.y[l], s.r[l] * s.noise[l], ok, age
-    machine_learn(
+    fields = packed((
         s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
-        s.at_start.ctypes.data, s.var.ctypes.data, n, s.var.shape[0], L, l,
-    )  # fmt: skip
+        s.at_start.ctypes.data, s.var.ctypes.data,
+    ))  # fmt: skip
+    machine_learn(fields, n, s.var.shape[0], L, l)
 
 
 @kernel
@@ -419,7 +427,7 @@ def absorb_row(s: State, theta: int, phi: int, age: float, l: int) -> None:
 def forecast_on_roots(s: State, l: int) -> None:
     """y_hat, e and h in square-root form."""
     y_hat = prediction(s, l)
-    foresee_row(s, s.phi.ctypes.data, l)
+    foresee_row(s, s.theta.ctypes.data, s.phi.ctypes.data, l)
     s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, s.at_start[BEFORE, l]
 
 
@@ -445,7 +453,7 @@ def correct_on_roots(s: State, l: int) -> None:
 @kernel
 def reform(s: State, l: int) -> None:
     """Recompute P from the square root, after a change that is not a sample."""
-    foresee_row(s, s.phi.ctypes.data, l)
+    foresee_row(s, s.theta.ctypes.data, s.phi.ctypes.data, l)
     call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
 
 

@@ -128,7 +128,7 @@ def forecast_root_form(s: State, l: int) -> None:
     for i in range(n):
         s.x[i, l], s.x[n + i, l] = s.theta[i, l], s.slope[i, l]
         s.z[i, l], s.z[n + i, l] = s.phi[i, l], 0.0
-    foresee_row(s, s.z.ctypes.data, l)
+    foresee_row(s, s.x.ctypes.data, s.z.ctypes.data, l)
     y_hat = prediction(s, l)
     s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, s.at_start[BEFORE, l]
 
