@@ -64,7 +64,7 @@ def test_pages_import_what_is_public():
 def test_what_a_function_packs_does_not_leave_it():
     """The numbers of `packed` are on the stack of the function that packs them, and gone when it returns."""
     sources = [*(Path(__file__).parents[1] / "src").rglob("*.py")]
-    assert sum("= packed((" in source.read_text(encoding="utf-8") for source in sources) >= 2
+    assert sum("= packed((" in source.read_text(encoding="utf-8") for source in sources) >= 1
     assert [source.name for source in sources if "return packed((" in source.read_text(encoding="utf-8")] == []
 
 

@@ -55,7 +55,7 @@ from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, vector
+from driftfit.engine.settings import as_numbers, check_numbers, factor, matrix, vector
 from driftfit.models.base import Model
 from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
@@ -121,9 +121,7 @@ class Bank(Tracker):
                 self._set(name, given)
         if self.reduce is not None and not isinstance(self.reduce, Reduction):
             raise ValueError(f"Bank: reduce must be a reduction such as Beam(9) or Decide(3); got {self.reduce!r}.")
-        if self.p0 is not None:
-            self._set("p0", covariance("Bank", "p0", self.p0))
-        self._set("theta0", numbers("Bank", "theta0", self.theta0))
+        check_numbers(self, ("p0",), (), ("theta0",))
         self._set("transition", _tuples(self.transition))
         self._set("initial", _tuples(self.initial))
         self._check()
