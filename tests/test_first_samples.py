@@ -27,30 +27,6 @@ def wrong(run, t):
     return np.abs(run.theta[t] - THETA).max()
 
 
-@pytest.mark.parametrize("signal", ["y", "u"])
-@pytest.mark.parametrize("code", [999.0, -1e6])
-def test_a_fault_code_at_any_of_the_first_samples_does_no_harm(signal, code):
-    y, u = plant()
-    clean = track(PLANT, AdaptiveKalman(), y, u)
-    for at in range(16):
-        broken = {"y": y.copy(), "u": u.copy()}
-        broken[signal][at] = code
-        run = track(PLANT, AdaptiveKalman(), broken["y"], broken["u"])
-        assert wrong(run, 150) < 0.06
-        assert np.abs(run.theta - clean.theta)[-1].max() < 0.01
-        assert np.abs(run.smooth().theta - THETA).max() < 0.15
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 8, 40])
-@pytest.mark.parametrize("unit", [1.0, 1e-6])
-def test_a_record_may_begin_with_a_run_of_fault_codes(count, unit):
-    y, u = plant()
-    y[:count] = 9999.0
-    run = track(PLANT, AdaptiveKalman(), unit * y, u)
-    theta = run.theta / [1.0, 1.0, unit, unit]
-    assert np.abs(theta[count + 100] - THETA).max() < 0.08
-
-
 @pytest.mark.parametrize("codes", [[], [4], [2, 9], [0, 1, 2], [*range(8)], [*range(40)]], ids=len)
 def test_what_was_left_out_is_listed_and_a_stream_lists_the_same(codes):
     y, u = plant()

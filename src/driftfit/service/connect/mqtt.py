@@ -168,7 +168,8 @@ def value_of(metric: Any) -> Any:
     if metric.is_null or kind is None:
         return None
     value, bits = getattr(metric, kind), SIGNED.get(metric.datatype, 0)
-    return value - (1 << bits) if bits and kind[:3] in ("int", "lon") and value >> (bits - 1) & 1 else value
+    half = 1 << bits >> 1
+    return (value + half) % (2 * half) - half if half and kind in ("int_value", "long_value") else value
 
 
 def _read(payload: bytes) -> Any:
