@@ -119,3 +119,25 @@ def test_a_start_between_two_levels_of_a_coarse_meter_has_no_fault_codes(tracker
     assert run.ok.all()
     assert left_out(run) == 0
     assert run.innovation_std[-1] > 0.2 * unit
+
+
+FIRST = pytest.param(0, 5, marks=pytest.mark.xfail(reason="a code at the very first pulse is believed", strict=True))
+
+
+@pytest.mark.parametrize(("code", "learned"), [(None, 2), FIRST, (1, 2)])
+def test_the_first_pulses_of_an_input_at_rest_are_learned_from(code, learned):
+    """Of two fault codes the first, at the first pulse of all, cannot be told from a response."""
+    rng = np.random.default_rng(4)
+    u, y = np.zeros((4, 500)), 0.1 * rng.normal(size=(4, 500))
+    for row, height in enumerate((1.0, 10.0, 1e-3, -1.0)):
+        pulses = np.arange(30 + 40 * row, 500, 50)
+        u[row, pulses] = height * rng.uniform(0.5, 1.5, len(pulses))
+        y[row] += 5.0 * u[row] / height
+        if code is not None:
+            y[row, pulses[code]] = -999.0
+    fleet = track(Regression(1), AdaptiveKalman(), y, u, by="row", gate=True)
+    for row, height in enumerate((1.0, 10.0, 1e-3, -1.0)):
+        pulses = np.flatnonzero(u[row])
+        assert (~fleet[row].ok).sum() <= {None: 0, 0: 2, 1: 1}[code]
+        assert fleet[row].theta[pulses[learned], 0] * height == pytest.approx(5.0, abs=0.5)
+        assert fleet[row].theta[pulses[-1], 0] * height == pytest.approx(5.0, abs=0.2)

@@ -77,6 +77,9 @@ def test_what_is_not_known_is_not_forecast():
     found = track(ARX(2, 1), Kalman(q=0.0, r=0.09), y, u).forecast(5, later)
     assert np.isfinite(found.y_std[:3]).all()
     assert np.isnan(found.y_std[3:]).all()
+    for h, inputs, message in ((0, None, "h must be a whole number"), (2, np.ones((2, 2)), "the model has 1 inputs")):
+        with pytest.raises(ValueError, match=message):
+            run.forecast(h, inputs)
 
 
 def test_outputs_that_are_lags_of_each_other():

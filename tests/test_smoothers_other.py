@@ -275,16 +275,6 @@ class TestForecast:
         P = run.cov(-1) + 2 * scale / 10.0 * np.eye(2)
         assert run.forecast(2, phi[:2]).y_std[1] ** 2 == pytest.approx(phi[1] @ P @ phi[1] + scale)
 
-    def test_what_is_not_known_is_not_forecast(self):
-        phi, y = record()
-        found = track(Regression(2), FLS(10.0), y, phi).forecast(2)
-        assert np.isfinite(found.theta).all()
-        assert np.isnan(found.y_hat).all()
-        with pytest.raises(ValueError, match="h must be a whole number"):
-            track(Regression(2), FLS(10.0), y, phi).forecast(0)
-        with pytest.raises(ValueError, match="the model has 2 inputs"):
-            track(Regression(2), FLS(10.0), y, phi).forecast(2, np.ones(2))
-
 
 class TestSquareRoot:
     @pytest.mark.parametrize("mu", [1e-12, 1.0, 1e6])
