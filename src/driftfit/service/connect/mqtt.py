@@ -59,14 +59,12 @@ PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")
 KNOWN_NODES = 100_000
 """Nodes and devices whose metrics are known."""
-METRIC = {
-    "name": 1, "alias": 2, "timestamp": 3, "datatype": 4, "is_historical": 5, "is_null": 7,
-    "int_value": 10, "long_value": 11, "float_value": 12, "double_value": 13, "boolean_value": 14, "string_value": 15,
-}  # fmt: skip
-"""Fields of a metric; of those from 10 on it has one. The others are data sets, templates and properties."""
-WIRE = {"name": 9, "datatype": 13, "int_value": 13, "float_value": 2, "double_value": 1, "string_value": 9}
-WIRE |= dict.fromkeys(("is_historical", "is_null", "boolean_value"), 8)
-"""Their types in protobuf, if not uint64."""
+METRIC = (
+    "string name 1, uint64 alias 2, uint64 timestamp 3, uint32 datatype 4, bool is_historical 5, bool is_null 7, "
+    "uint32 int_value 10, uint64 long_value 11, float float_value 12, double double_value 13, bool boolean_value 14, "
+    "string string_value 15"
+)
+"""Fields of a metric, with one value at most. Those that are left out are data sets, templates and properties."""
 SIGNED = {1: 8, 2: 16, 3: 32, 4: 64}
 """Bits of the signed types of data, which are sent as unsigned numbers."""
 REBIRTH = b"\x12\x1a\n\x14Node Control/Rebirth \x0bp\x01"
@@ -84,12 +82,16 @@ def _message() -> Any:
 
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b")
     payload, metric = (file.message_type.add(name=name) for name in ("Payload", "Metric"))
-    payload.field.add(name="timestamp", number=1, type=4, label=1)
-    payload.field.add(name="metrics", number=2, type=11, label=3, type_name=".Metric")
+    kind = descriptor_pb2.FieldDescriptorProto
+    payload.field.add(name="timestamp", number=1, type=kind.TYPE_UINT64, label=kind.LABEL_OPTIONAL)
+    many = {"type": kind.TYPE_MESSAGE, "label": kind.LABEL_REPEATED, "type_name": ".Metric"}
+    payload.field.add(name="metrics", number=2, **many)
     metric.oneof_decl.add(name="value")
-    for name, number in METRIC.items():
-        own = {"oneof_index": 0} if number >= 10 else {}
-        metric.field.add(name=name, number=number, type=WIRE.get(name, 4), label=1, **own)
+    for one in METRIC.split(", "):
+        of, name, number = one.split()
+        own = {"oneof_index": 0} if name.endswith("_value") else {}
+        own |= {"number": int(number), "type": kind.Type.Value(f"TYPE_{of.upper()}"), "label": kind.LABEL_OPTIONAL}
+        metric.field.add(name=name, **own)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("Payload"))
