@@ -50,7 +50,7 @@ from driftfit.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.bank.machine.advance import begin, limit_forgetting
 from driftfit.bank.machine.steps import steps_of
 from driftfit.bank.memory import SINGLE, arrays_of, outside, packed
-from driftfit.bank.prior import chains, events, per_sample
+from driftfit.bank.prior import chains, events, open_prior, per_sample
 from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.drivers import TrackerSteps
@@ -71,7 +71,8 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        Changes of theta between samples; the first is the normal course. None: a small drift, and a rare
+        Changes of theta between samples; the first is the normal course. If none has a prob, their probabilities are
+        learned. None: a small drift, and a rare
         jump of any parameter, both scale-free.
     sensors : list of Sensor
         How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance. A spike is
@@ -183,6 +184,11 @@ class Bank(Tracker):
     @property
     def event_probabilities(self) -> tuple[Array, Array]:
         return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the probabilities of the changes are learned."""
+        return open_prior(self.all_changes, self.transition, len(self.all_sensors))
 
     @property
     def independent(self) -> bool:

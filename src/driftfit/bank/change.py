@@ -36,7 +36,8 @@ class Change(Settings):
     size : number, (k,) or None
         Scale-free, instead of q: standard deviation of the change in units of sqrt(r / c_i).
     prob : number or None
-        Prior probability at every sample; None is the remainder of the others.
+        Prior probability at every sample; None is the remainder of the others. If it is None for all of several
+        changes, and there is no transition, they are learned (`driftfit.bank.prior`).
     which : indices or None
         The parameters that change; None is all.
     forget : number in (0, 1]
