@@ -27,8 +27,7 @@ from driftfit.run.result import Track
 from lab.bench.oracle import known_walk
 
 N, T, FIRST, NEAR = 2, 600, 30, 6
-LADDER = (0.5, 5.0, 50.0, 500.0)
-FIXED = LADDER[:3]
+FIXED = (0.5, 5.0, 50.0)
 SIZES = (0.05, 0.5, 1.6, 5.0, 16.0, 50.0, 500.0)
 REDUCTIONS = (
     Decide(1), Decide(3), Decide(5), GPB(2), GPB(4), IMM(), Hybrid(9), Beam(3), Beam(9), Beam(32), Resample(3),
@@ -85,10 +84,9 @@ def told(size: float, rate: float, reduce: Reduction | None = None) -> Bank:
     return Bank([Change(0.0), Change(size**2, prob=rate)], [Sensor.nominal(1.0)], reduce=reduce, p0=100.0)
 
 
-def of_sizes(sizes: Sequence[float], prob: float | None, r: float | None) -> Bank:
-    """A slow drift and jumps of these sizes; without ``prob`` their probabilities are learned."""
-    jumps = [Change(size=size, prob=prob) for size in sizes]
-    return Bank([Change(size=0.003), *jumps], [Sensor.nominal(r)], reduce=Resample(9))
+def of_size(size: float, prob: float, r: float | None) -> Bank:
+    """A slow drift, and jumps of one size."""
+    return Bank([Change(size=0.003), Change(size=size, prob=prob)], [Sensor.nominal(r)], reduce=Resample(9))
 
 
 def reductions(records: int) -> None:
@@ -116,8 +114,8 @@ def priors(records: int) -> None:
         errors = []
         for rate in (1 / 30, 1 / 100, 1 / 1000):
             for size in SIZES:
-                banks = {name: of_sizes([float(name)], 0.01, r) for name in names[1:-1]}
-                banks |= {"told": of_sizes([size], rate, r), "learned": of_sizes(LADDER, None, r)}
+                banks = {name: of_size(float(name), 0.01, r) for name in names[1:-1]}
+                banks |= {"told": of_size(size, rate, r), "learned": Bank(Change.unknown(), [Sensor.nominal(r)])}
                 found = scores(banks, size, rate, records)
                 errors.append([found[name][0] for name in names])
                 row = [f"{found[name][k]:8.{digits}f}" for k, digits in ((0, 2), (1, 1)) for name in names]
