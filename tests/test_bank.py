@@ -110,6 +110,16 @@ def test_open_probabilities_are_the_means_of_expected_counts():
     assert run.smooth().prior[5, 1:].sum() == pytest.approx(1.0 - rates["none"])
 
 
+def test_rate_and_size_of_jumps_are_learned():
+    rng = np.random.default_rng(5)
+    z, jumped = rng.standard_normal((1500, N)), rng.random((1500, 1)) < 0.05
+    theta = np.cumsum(jumped * rng.normal(0.0, 5.0, (1500, N)), axis=0)
+    run = track(Regression(N), Bank(Change.unknown()), np.sum(z * theta, axis=1) + rng.standard_normal(1500), z)
+    rates = run.hypotheses.rates
+    assert rates["jump 5"] == pytest.approx(jumped.mean(), rel=0.3)
+    assert max(rates["jump 50"], rates["jump 500"]) < 0.005
+
+
 OPEN = [Change(0.0), Change(0.6), Change(60.0)]
 
 
