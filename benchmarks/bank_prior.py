@@ -126,10 +126,35 @@ def priors(records: int) -> None:
             print(f"{name:8}/told" + "".join(f"{x:8.2f}" for x in ratio))
 
 
+def changing(records: int) -> None:
+    """Errors over the oracle's after rate and size have changed at two thirds of 6000 samples."""
+    print("at first      then           0.5       5      50 learned")
+    for (rate, size), (late, last) in (
+        ((0.0005, 5), (0.03, 0.5)),
+        ((0.03, 0.5), (0.001, 5)),
+        ((0.03, 5), (0.002, 0.5)),
+    ):
+        squares = np.zeros(2 + len(FIXED))
+        for seed in range(records):
+            rng, first = np.random.default_rng([seed, int(1e4 * rate)]), np.arange(6000) < 4000
+            q = np.where(first, size, last) ** 2 * (rng.random(6000) < np.where(first, rate, late))
+            phi, theta = rng.standard_normal((6000, N)), np.zeros((6000, N))
+            theta += np.cumsum(np.sqrt(q)[:, None] * rng.standard_normal((6000, N)), axis=0)
+            y = np.sum(phi * theta, axis=1) + rng.standard_normal(6000)
+            banks = [*(of_size(one, 0.01, 1.0) for one in FIXED), Bank(Change.unknown(), [Sensor.nominal(1.0)])]
+            found = [track(Regression(N), bank, y, phi).theta for bank in banks]
+            ideal = known_walk(y, phi, 0, np.tile(q[:, None], N), np.ones(6000)).theta
+            squares += [np.sum((path - theta)[~first] ** 2) for path in (ideal, *found)]
+        row = "".join(f"{x:8.2f}" for x in np.sqrt(squares[1:] / squares[0]))
+        print(f"{size:g} at {rate:<7g} {last:g} at {late:<6g}" + row)
+
+
 def main(quick: bool = False) -> None:
     reductions(3 if quick else 40)
     print()
     priors(1 if quick else 20)
+    print()
+    changing(1 if quick else 6)
 
 
 if __name__ == "__main__":

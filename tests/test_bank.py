@@ -102,7 +102,7 @@ def test_open_probabilities_are_the_means_of_expected_counts():
     for t in range(len(Y)):
         live.update(Y[t], U[t], prob=counts / counts.sum())
         counts += (
-            bank.reported(live.lane()["report"], "lag_prob")[-1].reshape(4, 2).sum(axis=1) - (counts - start) / 2000
+            bank.reported(live.lane()["report"], "lag_prob")[-1].reshape(4, 2).sum(axis=1) - (counts - start) / 500
         )
         np.testing.assert_allclose(run.theta[t], live.theta, atol=1e-10)
     rates = run.hypotheses.rates
