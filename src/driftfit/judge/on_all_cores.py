@@ -38,6 +38,9 @@ WORTH = 5.0
 BATCH = 0.2
 """Seconds of work that are sent to a process at once."""
 
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+"""A process has one core: threads of its linear algebra would wait for one another, and take twice the time."""
+
 SERVE = "from driftfit.judge.on_all_cores import serve; serve()"
 
 
@@ -104,7 +107,7 @@ class Processes:
                 [sys.executable, "-c", SERVE],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                env=os.environ | {"PYTHONPATH": path},
+                env=os.environ | {"PYTHONPATH": path} | ONE_THREAD,
             )
             for _ in range(count)
         ]
