@@ -339,10 +339,7 @@ class AdaptiveKalman(Tracker):
             facts.append(not_learned(run, names[never]))
         if lately.any():
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (
-            *facts,
-            *colour(lane),
-        )
+        return (*facts, *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
