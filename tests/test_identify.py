@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
+from driftfit.identify import answer
 from driftfit.identify.answer import _Task
 from driftfit.identify.judgement import Move, density, weights
-from driftfit.identify.page import SCHEMA, commands, verb
+from driftfit.identify.page import SCHEMA, SCHEMA_OF_RECORDS, commands, verb
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
 from driftfit.identify.structure import Structure, search
@@ -155,7 +156,7 @@ def test_the_budget_narrows_the_search_and_what_is_judged():
     short = search(y[:120], U[:120], 30, 0, monotonic() + 9.0, np.random.default_rng(0))
     assert "up to 12 instead of 30" in short.narrowed
     found = identify(pl.read_csv(PUMP).drop("time"), y="flow", budget=0.0)
-    assert "only the last 500 of 800 samples were judged" in str(found)
+    assert "only the last 500 samples of 800 were judged" in str(found)
     assert found.track.time[0] == 300  # rows are counted from the first of the file
 
 
@@ -196,14 +197,24 @@ def test_the_answer_for_a_pump(pump):
         assert said in str(pump)
 
 
+KINDS = {"string": str, "object": dict, "array": list, "number": float, "boolean": bool, "null": type(None)}
+
+
+def fits(data, schema):
+    """Whether plain data have a form, by the words of JSON Schema that ours use."""
+    types = schema.get("type", [])
+    assert not types or isinstance(data, tuple(KINDS[one] for one in ([types] if isinstance(types, str) else types)))
+    assert data in schema.get("enum", [data])
+    assert data == schema.get("const", data)
+    if isinstance(data, dict):
+        own, other = schema.get("properties", {}), schema.get("additionalProperties", {})
+        assert set(schema.get("required", [])) <= data.keys()
+        assert all(fits(one, own.get(name, other)) for name, one in data.items())
+    return True
+
+
 def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
-    data, own = pump.json(), SCHEMA["properties"]
-    assert data.keys() == own.keys()
-    assert data["answer"] in own["answer"]["enum"]
-    json.dumps(data, allow_nan=False)
-    kinds = {"string": str, "object": dict, "array": list}
-    typed = {name: kinds[one["type"]] for name, one in own.items() if str(one.get("type")) in kinds}
-    assert {name: type(data[name]) for name in typed} == typed
+    assert fits(json.loads(json.dumps(pump.json(), allow_nan=False)), SCHEMA)
     page = pump.page(tmp_path / "pump.html")
     assert (tmp_path / "pump.html").read_text(encoding="utf-8") == page
     heads = [
@@ -255,13 +266,22 @@ def test_parameters_move_only_if_the_structures_that_came_next_say_so():
     )
 
 
-def test_records_with_one_structure(tmp_path):
+def test_records_with_one_structure(tmp_path, monkeypatch):
     table = pl.read_csv(PUMP).with_columns(
         unit=pl.when(pl.int_range(800) < 400).then(pl.lit("a")).otherwise(pl.lit("b"))
     )
-    found = identify(table, y="flow")
-    assert "records by unit (--by)" in " ".join(str(found).split())
-    assert found.json()["records"].keys() == {"a", "b"}
+    found = identify(table.sort("speed").drop("time"), y="flow", by="unit")  # the rows of both are mixed
+    assert [list(one) for one in (found.track["a"].time[:3], found.track["b"].time[-3:])] == [
+        [0, 1, 2],
+        [397, 398, 399],
+    ]
+    monkeypatch.setattr(answer, "LEAST", 300)
+    found = identify(table, y="flow", budget=0.0)
+    said = " ".join(str(found).split())
+    assert "records by unit (--by)" in said
+    assert "only the last 300 samples of every record were judged (--budget)" in said
+    assert {key: len(run) for key, run in found.track.items()} == {"a": 300, "b": 300}
+    assert fits(json.loads(json.dumps(found.json(), allow_nan=False)), SCHEMA_OF_RECORDS)
     assert found.page(tmp_path / "both.html").index("All records") > 0
 
 

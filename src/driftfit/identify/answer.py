@@ -18,7 +18,7 @@ import numpy as np
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.identify.judgement import effects, errors_of, feedback, moves
+from driftfit.identify.judgement import effects, errors_of, feedback, moves, with_lags
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
 from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
@@ -33,7 +33,7 @@ from driftfit.tracking import track
 
 LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
-RATE, LEAST = 1000.0, 500
+RATE, LEAST = 50_000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
 """Records of a fleet that have a page."""
@@ -95,16 +95,17 @@ def identify(
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
+    model = model_of(found, structure.shape)
+    found, structure = task.affordable(found, structure, model.n)
     if found.by is None:
         return task.judged(found, structure)
     progress("tracking")
-    model = model_of(found, structure.shape)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
     verdicts, worst = fleet.verdict(level), {}
     for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
         at = np.flatnonzero([one == key for one in found.key])
         worst[key] = task.judged(replace(found.rows(at), by=None), structure)
-    return ManyIdentified(model, fleet, verdicts, worst, found)
+    return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure))
 
 
 def check_record(found: Roles) -> None:
@@ -154,24 +155,25 @@ class _Task:
             best = replace(best, forecast=search(y, U, max_lag, 1, end, rng))
         return best
 
-    def tracked(self, found: Roles, shape: Shape) -> tuple[Track, Evidence]:
-        """The run of a structure, and what it says of the record."""
-        model = model_of(found, shape)
-        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
-        return run, Evidence(run, level=self.level)
+    def affordable(self, found: Roles, structure: Structure, n: int) -> tuple[Roles, Structure]:
+        """As many of the last samples of every record as can be judged in what is left of the budget, and the note."""
+        sizes = [len(part) for part in found.parts]
+        most = max(LEAST, int(RATE * (self.end - monotonic()) / n / len(sizes)))
+        if most >= max(sizes):
+            return found, structure
+        of = str(sizes[0]) if found.by is None else "every record"
+        short = f"only the last {most} samples of {of} were judged (--budget)"
+        narrowed = "; ".join(filter(None, (structure.narrowed, short)))
+        return found.last(most), replace(structure, narrowed=narrowed)
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
-        """The answer for one record, or its last part if time is short."""
-        model, T = model_of(found, structure.shape), len(found.y)
-        most = max(LEAST, int(RATE * (self.end - monotonic()) / model.n))
-        if most < T:
-            short = f"only the last {most} of {T} samples were judged (--budget)"
-            structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
-            found = found.last(most)
-        y, U, place = found.spread(structure.na + 40)
+        """The answer for one record."""
+        model = model_of(found, structure.shape)
         self.progress("tracking")
-        run, known = self.tracked(found, structure.shape)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        known = Evidence(run, level=self.level)
         self.progress("time or working point")
+        y, U, place = replace(found, y=run.used_record.y).spread(structure.na + 40)
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
         verdict = judged(known)
@@ -181,8 +183,10 @@ class _Task:
             whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
             again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
             besides = again is None or again.rejected
-        others = (self.tracked(found, shape)[1].p for shape, *_ in structure.second if besides)
-        least = next((p for p in others if p >= self.level), 0.0)
+        others = (
+            judged_rows(with_lags(rows, y, U, place, shape), self.level) for shape, *_ in structure.second if besides
+        )
+        least = next((one.test.p for one in others if one is not None and not one.rejected), 0.0)
         theta, memory, own = effects(known)
         moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
         other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
@@ -202,16 +206,22 @@ def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -
     """Problems of the data, each in a few words."""
     fed = [j for j in structure.lags if feedback(y, U[:, j])]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
-    notes = (
-        "" if found.inputs else f"no input moves, so only its own past can explain {found.output}",
-        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
+    return (
+        *_of_data(found, structure),
         *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
-        f"missing readings: {found.missing}" if found.missing else "",
-        f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
+        *([f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []),
         *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
-        structure.narrowed,
     )
-    return tuple(filter(None, notes))
+
+
+def _of_data(found: Roles, structure: Structure) -> tuple[str, ...]:
+    """Those of all records."""
+    return (
+        *([] if found.inputs else [f"no input moves, so only its own past can explain {found.output}"]),
+        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
+        *([f"missing readings: {found.missing}"] if found.missing else []),
+        *([structure.narrowed] if structure.narrowed else []),
+    )
 
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:

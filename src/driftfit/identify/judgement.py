@@ -17,9 +17,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.identify.roles import NoAnswerError
-from driftfit.identify.structure import Pool
+from driftfit.identify.structure import Pool, Shape
+from driftfit.judge.changes.null import Lags
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
+from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
 from driftfit.judge.verdict import Verdict
@@ -180,6 +182,21 @@ def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move,
                 found.append(Move(what, event.kind, *values, *ends, event.at, instead))
         theta = theta if event.kind == "temporary" else after
     return tuple(found)
+
+
+def with_lags(rows: Rows, y: Array, U: Array, place: Array, shape: Shape) -> Rows:
+    """Rows of a run with the regressors of another structure, where these are known on the grid; see `Roles.spread`."""
+    at, (na, inputs) = place[rows.at], shape
+    lags = [moved(y, k + 1) for k in range(na)]
+    each = [moved(U[:, j], k) for j, nb, nk in inputs for k in range(nk, nk + nb)]
+    phi = np.column_stack([*lags, *each, np.ones(len(y))])[at]
+    found = rows._replace(phi=phi, lags=None).only(np.isfinite(phi).all(axis=1), range(phi.shape[1]))
+    at, root = place[found.at], np.broadcast_to(found.root, found.y.shape)
+    row = np.full(len(y), -1)
+    row[at] = np.arange(len(at))
+    source = row[at[:, None] - np.arange(1, na + 1)]
+    lagged = Lags(np.arange(na), source, root[:, None] / np.where(source < 0, 1.0, root[source])) if na else None
+    return found._replace(phi=found.phi * root[:, None], lags=lagged)
 
 
 def feedback(y: Array, u: Array) -> bool:

@@ -50,6 +50,15 @@ PROPERTIES: dict[str, Any] = {
 }  # fmt: skip
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
+RECORD = {"moves": {"type": ["boolean", "null"]}, "p": PROPERTIES["p"], "q": PROPERTIES["p"]}
+RECORDS: dict[str, Any] = {
+    "schema": {"const": f"{NAME}/records"},
+    **{key: PROPERTIES[key] for key in ("headline", "model", "roles", "notes")},
+    "records": {"type": "object", "additionalProperties": {"type": "object", "properties": RECORD}},
+    "worst": {"type": "object", "additionalProperties": SCHEMA},
+}  # fmt: skip
+SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": list(RECORDS), "properties": RECORDS}
+"""JSON Schema of `ManyIdentified.json`."""
 CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
 its 95 % band, from the past only. Red: when it changed."""
 
@@ -218,8 +227,7 @@ def as_json(answer: Identification) -> dict[str, Any]:
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
-        "model": repr(answer.model), "p": answer.verdict.p, "roles": {one: getattr(roles, one) for one in
-        ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")},
+        "model": repr(answer.model), "p": answer.verdict.p, "roles": roles.plain,
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
         "commands": commands(answer), "unit": unit(answer),
@@ -306,7 +314,7 @@ def page_of_many(answer: ManyIdentified, path: Any = None) -> str:
     """One page: the table of all records, then the three that move most clearly."""
     heads, verdict = ("record", "what moves", "p", "q", "error", "of constants", "pays"), answer.verdict
     rows = [(escape(str(row.key)), *map(escape, row.cells)) for row in verdict.rows]
-    shown = table("The clearest first.", heads, rows, (1,)) + _listed(columns(answer.roles))
+    shown = table("The clearest first.", heads, rows, (1,)) + _listed([*columns(answer.roles), *answer.notes])
     parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences), section("All records", shown)]
     for key, one in answer.worst.items():
         parts += [f"<h2>{escape(str(key))}</h2>", opening([conclusion(one)]), *body(one)]
@@ -392,6 +400,7 @@ class ManyIdentified(Printed):
     verdict: ManyVerdicts = field(repr=False)
     worst: Mapping[Any, Identification]
     roles: Roles = field(repr=False)
+    notes: tuple[str, ...]
     page = page_of_many
 
     @property
@@ -408,12 +417,14 @@ class ManyIdentified(Printed):
         """The records by key, and in ``worst`` the clearest as for one record."""
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
         worst = {str(key): one.json() for key, one in self.worst.items()}
-        shown = {"schema": f"{NAME}/records", "headline": self.headline}
-        return shown | {"records": finite(rows), "worst": worst}
+        shown = {"schema": f"{NAME}/records", "headline": self.headline, "model": repr(self.model), "notes": self.notes}
+        data: dict[str, Any] = finite(shown | {"roles": self.roles.plain, "records": rows, "worst": worst})
+        return data
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
-        yield Text(" " + "\n ".join(columns(self.roles)))
+        data = f"Data: {'; '.join(self.notes)}." if self.notes else ""
+        yield Text("\n".join(f" {line}" for text in (*columns(self.roles), data) for line in wrap(text, WIDTH - 1)))
         yield self.verdict
         for key, one in self.worst.items():
             yield Text(f"\n {key}: {one.headline}")

@@ -57,10 +57,23 @@ class Roles:
     zone: str | None = None
 
     @property
+    def plain(self) -> dict[str, Any]:
+        """What is not data of single rows."""
+        return {
+            one: getattr(self, one) for one in ["output", "inputs", "clock", "by", "dt", "why", "refused", "missing"]
+        }
+
+    @property
     def groups(self) -> Array:
         """(T,): number of the record of every row."""
         place = {key: k for k, key in enumerate(dict.fromkeys(self.key))}
         return np.array([place[key] for key in self.key])
+
+    @property
+    def parts(self) -> list[Array]:
+        """The rows of every record."""
+        groups = self.groups
+        return np.split(np.argsort(groups, kind="stable"), np.cumsum(np.bincount(groups))[:-1])
 
     def rows(self, at: Array) -> Roles:
         """Some rows."""
@@ -68,15 +81,14 @@ class Roles:
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at))
 
     def last(self, count: int) -> Roles:
-        """The last rows; without a clock their numbers are the time."""
-        at = np.arange(len(self.y) - count, len(self.y))
+        """The last rows of every record; without a clock their numbers are the time."""
+        at = np.sort(np.concatenate([part[-count:] for part in self.parts]))
         kept = self.rows(at)
         return kept if self.time is not None else replace(kept, time=at.astype(float), dt=1.0)
 
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
-        parts = [np.flatnonzero(self.groups == k) for k in range(self.groups.max() + 1)]
-        means = np.array([np.nanmean(np.column_stack([self.y, self.U])[at], axis=0) for at in parts])[self.groups]
+        means = np.array([np.nanmean(np.column_stack([self.y, self.U])[at], axis=0) for at in self.parts])[self.groups]
         return replace(self, y=self.y - means[:, 0], U=self.U - means[:, 1:])
 
     def signals(self, inputs: Sequence[str]) -> dict[str, Any]:
@@ -154,7 +166,7 @@ def roles(
 def _in_order(found: Roles) -> Roles:
     """The record by key and time, without rows that repeat a time or have none, and with its interval."""
     if found.time is None:
-        return found
+        return found.rows(np.argsort(found.groups, kind="stable"))
     order = np.lexsort((found.time, found.groups))
     order = order[np.isfinite(found.time[order])]
     time, groups = found.time[order], found.groups[order]
