@@ -380,9 +380,7 @@ def identify_command(
     ] = None,
     budget: Annotated[
         float,
-        Option(
-            help="Seconds for one record.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))
-        ),
+        Option(help="Seconds.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))),
     ] = 45.0,
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
     page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,

@@ -70,8 +70,8 @@ def identify(
     gate : bool or None
         As for `track`. None: that of the default tracker, and no answer if more than `LEFT_OUT` of the readings go.
     budget : number
-        Seconds for one record. The search stops after a third of them; then as many of the last samples are judged as
-        are expected to take what is left. For several records it is that of the search.
+        Seconds. The search stops after a third of them; then as many of the last samples of every record are judged as
+        are expected to take what is left, but at least `LEAST`.
     seed, progress : int, callable
         Seed of the displaced copies of inputs; told what is being done.
     reading : Wanted or None

@@ -191,7 +191,7 @@ def with_lags(rows: Rows, y: Array, U: Array, place: Array, shape: Shape) -> Row
     each = [moved(U[:, j], k) for j, nb, nk in inputs for k in range(nk, nk + nb)]
     phi = np.column_stack([*lags, *each, np.ones(len(y))])[at]
     found = rows._replace(phi=phi, lags=None).only(np.isfinite(phi).all(axis=1), range(phi.shape[1]))
-    at, root = place[found.at], np.broadcast_to(found.root, found.y.shape)
+    at, root = place[found.at], np.broadcast_to(np.asarray(found.root, float), found.y.shape)
     row = np.full(len(y), -1)
     row[at] = np.arange(len(at))
     source = row[at[:, None] - np.arange(1, na + 1)]
