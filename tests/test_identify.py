@@ -15,7 +15,7 @@ from driftfit import identify
 from driftfit.cli import app
 from driftfit.identify import answer
 from driftfit.identify.answer import _Task
-from driftfit.identify.judgement import Move, density, weights
+from driftfit.identify.judgement import Move, mixed, weights
 from driftfit.identify.page import SCHEMA, SCHEMA_OF_RECORDS, commands, verb
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
@@ -178,12 +178,15 @@ def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
     t = 700
     assert steps_ahead(theta, phi, 1, 1)[t] == pytest.approx(theta[t] @ phi[t])
     assert steps_ahead(theta, phi, 1, 2)[t + 1] == pytest.approx(theta[t] @ [theta[t] @ phi[t], *phi[t + 1, 1:]])
-    early = np.arange(T) < T // 2
-    variance = np.where(early, 0.5, 2.0) ** 2
-    first, second = np.random.default_rng(5).normal(size=(2, T)) * np.sqrt([variance, variance[::-1]])
-    w = weights(-0.5 * (np.log(2.0 * np.pi * variance) + first**2 / variance), density(second))
+    size = np.where(np.arange(T) < T // 2, 0.5, 2.0)
+    first, second = np.random.default_rng(5).normal(size=(2, T)) * [size, size[::-1]]
+    w = weights(first, second)
     assert np.sqrt(np.mean((w * first + (1.0 - w) * second) ** 2)) < 0.75
     assert w[:11] == pytest.approx(0.5)
+    late = np.where(np.arange(T) < 150, 6.0, 0.8) * second / size[::-1]  # errors at first do not count for ever
+    assert weights(first / size, late)[-1] < 0.1
+    bad = np.where(np.arange(T) == 600, 1e4, second)  # an outlying error of one says nothing for long
+    assert np.sqrt(np.mean(mixed(y, first, bad, 3)[500:] ** 2)) < 1.5
 
 
 def test_the_answer_for_a_pump(pump):

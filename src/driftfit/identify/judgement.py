@@ -1,11 +1,15 @@
 """Judgement of a structure: predictions of the tracker and of constants mixed as they go, and effects in plain units.
 
-With p_1 and p_2 the densities of a reading under the tracker and under recursive least squares on the same regressors,
+With e_1 and e_2 the errors of the tracker and of recursive least squares on the same regressors, and v the mean square
+of the better so far,
 
-    w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
+    p_i = exp(-e_i^2 / 2 v),   w_t = s + (1 - 2 s) w_(t-1) p_1 / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),
+    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
-so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample; those h steps ahead are given the inputs, and weighed by what is known then.
+so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). With
+one v for both, they are weighed by what is reported, squared errors. The bound needs bounded predictions, so each stays
+within the outputs so far, widened by their range. All predictions are made before the sample; those h steps ahead are
+given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.structure import Pool, Shape
 from driftfit.judge.changes.null import Lags
@@ -78,29 +82,28 @@ class Move(NamedTuple):
     instead: tuple[str, ...]
 
 
-def density(e: Array) -> Array:
-    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first `LEAST`."""
-    known = np.isfinite(e)
-    square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
-    v = np.where(count > LEAST, np.maximum(np.cumsum(square) - square, SMALL) / np.maximum(count, 1), 1.0)
-    return np.where(known & (count > LEAST), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
-
-
-@Driver
-def _weigh(ratio: Array, weight: Array) -> None:
-    """`weights` (T,) from the ratios (T,) of both densities."""
-    now = 0.5
-    for t in range(ratio.shape[0]):
-        weight[t], after = now, now * ratio[t]
-        now = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after)
-
-
 def weights(first: Array, second: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,) (Herbster and
-    Warmuth, 1998)."""
-    weight = np.empty(len(first))
-    _weigh(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)), weight)
-    return weight
+    """The weight (T,) of the first of two predictions before each sample, from their errors (T,)."""
+    known = np.isfinite(first) & np.isfinite(second)
+    squares = np.where(known, np.square([first, second]), 0.0)
+    before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
+    v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
+    with np.errstate(over="ignore"):
+        worth = np.where(count > LEAST, (squares[1] - squares[0]) / (2.0 * v), 0.0)
+    now, found = 0.5, []
+    for ratio in np.exp(np.clip(worth, -50.0, 50.0)).tolist():
+        found.append(now)
+        now = SHARE + (1.0 - 2.0 * SHARE) * now * ratio / (1.0 - now + now * ratio)
+    return np.array(found)
+
+
+def mixed(y: Array, first: Array, second: Array, h: int) -> Array:
+    """Errors (T,) of the mixture of two predictions h steps ahead of y (T,), from their errors (T,)."""
+    past = moved(y, h)
+    low, high = np.fmin.accumulate(past), np.fmax.accumulate(past)
+    first, second = (y - np.clip(y - e, 2.0 * low - high, 2.0 * high - low) for e in (first, second))
+    w = np.append(np.full(h - 1, 0.5), weights(first, second))[: len(y)]
+    return w * first + (1.0 - w) * second
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
@@ -110,13 +113,11 @@ def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
     far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
-    cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
+    cases = [(1, own.tracked, own.constant_ls, rivals)]
     if horizon > 1:
-        last = {"persistence": y - moved(persistence(y), horizon - 1)}
-        cases.append((horizon, far[0], far[1], density(far[0]), last))
-    for h, tracked, constants, likely, others in cases:
-        w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
-        errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
+        cases.append((horizon, *far, {"persistence": y - moved(persistence(y), horizon - 1)}))
+    for h, tracked, constants, others in cases:
+        errors = {"driftfit": mixed(y, tracked, constants, h), "tracked": tracked, "constants": constants, **others}
         at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
         found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
     return tuple(found)
