@@ -36,9 +36,9 @@ def plant(change, seed=0):
     """y with one lag, an effect of u1 at delay 6 that is constant, jumps or is bent, one of u2 at once; u3 is idle."""
     rng = np.random.default_rng(seed)
     U, y = rng.normal(size=(T, 3)), np.zeros(T)
-    gain = np.where((np.arange(T) > 450) & (change == "time"), 2.0, 1.0)
+    gain = np.where((np.arange(T) > 450) & (change in ("time", "both")), 2.0, 1.0)
     for t in range(6, T):
-        x = np.abs(U[t - 6, 0]) if change == "working point" else U[t - 6, 0]
+        x = np.abs(U[t - 6, 0]) if change in ("working point", "both") else U[t - 6, 0]
         y[t] = 0.5 * y[t - 1] + gain[t] * x + 0.6 * U[t, 1] + rng.normal()
     return y, U
 
@@ -123,16 +123,16 @@ def test_scores_are_those_of_a_slow_twin_and_each_added_column_that_of_the_large
     assert np.isneginf(added[:2]).all()
 
 
-@pytest.mark.parametrize("change", ["", "time", "working point"])
+@pytest.mark.parametrize("change", ["", "time", "working point", "both"])
 def test_structure_and_cause(change):
     y, U = plant(change)
     found, late = searched(y, U), searched(y, U, first=1)
-    assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)}) if change != "working point" else True
+    assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)})  # also where it is even
     assert all(nk >= 1 and j != 1 for j, (_, nk) in late.lags.items())
     given = Structure(1, {0: (1, 6), 1: (1, 0)})
     phi, made = regressors(y, U), products(y, U, given, ("u1", "u2", "u3"), "y", 0)
     rows = np.isfinite(phi).all(axis=1)
-    assert cause(phi[rows], y[rows], made[0][rows], made[1]).kind(change == "time") == change
+    assert cause(phi[rows], y[rows], made[0][rows], made[1]).kind(change in ("time", "both")) == change
 
 
 def test_the_logarithm_of_the_output_is_compared_on_its_scale():
@@ -267,6 +267,14 @@ def test_parameters_move_only_if_the_structures_that_came_next_say_so():
     assert (
         "rejected with the chosen structure (p < 0.0001), but not with one of" in task.judged(found, without).headline
     )
+
+
+def test_a_curve_and_a_change_are_both_said():
+    y, U = plant("both")
+    found = identify({"y": y, "u": U[:, 0], "v": U[:, 1]}, y="y")
+    assert (found.kind, [(one.what, 440 <= one.at <= 460) for one in found.moves]) == ("both", [("u", True)])
+    assert "a bend of u" in found.headline.partition("Besides this: ")[0]
+    assert found.headline.partition("Besides this: ")[2].startswith("The curve of u on y")
 
 
 def test_records_with_one_structure(tmp_path, monkeypatch):

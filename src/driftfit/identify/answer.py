@@ -24,6 +24,7 @@ from driftfit.identify.roles import NoAnswerError, Roles, roles
 from driftfit.identify.scores import FEWEST
 from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
+from driftfit.judge.changes.words import events
 from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
 from driftfit.judge.verdict import Verdict, judged, p_equals
 from driftfit.models.arx import ARX
@@ -177,18 +178,17 @@ class _Task:
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
         verdict = judged(known)
-        besides = bool(verdict.drifts)
+        besides, again = bool(verdict.drifts), None
         if besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
-            whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
-            again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
+            curved = more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1]))
+            again = judged_rows(curved, self.level)
             besides = again is None or again.rejected
         others = (
             judged_rows(with_lags(rows, y, U, place, shape), self.level) for shape, *_ in structure.second if besides
         )
         least = next((one.test.p for one in others if one is not None and not one.rejected), 0.0)
-        theta, memory, own = effects(known)
-        moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
+        memory, own = effects(known)
         other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
         why = f"constants are rejected {other}" if least else verdict.untested
         share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
@@ -197,9 +197,13 @@ class _Task:
             why += "if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
-        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
-                              _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict),
-                              self.source)  # fmt: skip
+        happened, told, curve = verdict.events if kind in ("moves", "both") else (), rows, ()
+        if kind == "both" and again is not None:
+            told, curve = curved, why_not.of
+            happened = events(again, [*model.names, *curve], told.at, run.time_text)
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own,
+                              moves(happened, run, told, curve, memory.root), memory, errors_of(known, self.horizon), _notes(found, run, y, U, structure),
+                              _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:

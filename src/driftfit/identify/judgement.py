@@ -14,6 +14,7 @@ given the inputs, and weighed by what is known then.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -23,12 +24,12 @@ from driftfit.engine.kernel import Array
 from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.structure import Pool, Shape
 from driftfit.judge.changes.null import Lags
+from driftfit.judge.changes.words import Event
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
-from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 from driftfit.use.simulate import moved, steps_ahead
 
@@ -70,7 +71,9 @@ class Memory(NamedTuple):
 
 
 class Move(NamedTuple):
-    """What an event did to one effect: the static gain of an input, the ``memory`` (sum of a) or the ``level``."""
+    """What an event did to one effect: the static gain of an input, or of a ``bent`` one the standard deviation; the
+    ``memory`` (sum of a) or the ``level``.
+    """
 
     what: str
     kind: str
@@ -80,6 +83,7 @@ class Move(NamedTuple):
     last: str
     at: int
     instead: tuple[str, ...]
+    bent: bool = False
 
 
 def weights(first: Array, second: Array) -> Array:
@@ -137,8 +141,8 @@ def parts(run: Track) -> dict[str, Array]:
     return found
 
 
-def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
-    """Constants theta (n,), the memory of y, and the effects of the inputs."""
+def effects(known: Evidence) -> tuple[Memory, tuple[Effect, ...]]:
+    """The memory of y, and the effects of the inputs."""
     phi, y, own = known.rows.phi, known.rows.y, parts(known.run)
     inverse = pseudo_inverse(phi)
     theta = inverse @ y
@@ -152,35 +156,43 @@ def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
         std, alone = (float(np.sqrt(one @ cov @ one)) for one in (slope, own[name] / rest))
         name, least = (known.run.labels.y, std) if name == "level" else (name, alone)  # a level is that of all lags
         found.append(Effect(name, gain, std, FOUND * least))
-    return theta, memory, tuple(found)
+    return memory, tuple(found)
 
 
-def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
-    """The events of a verdict as changes of effects; ``theta`` (n,) are constants.
+def moves(happened: Sequence[Event], run: Track, rows: Rows, curve: Sequence[str], root: bool) -> tuple[Move, ...]:
+    """Events of ``rows`` as changes of effects; ``curve`` are the names of columns behind those of the model.
 
-    The level is that at mean inputs, and is left out where it moves with others by less than an error of predictions:
-    an effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample.
+    The level is that at mean inputs, and is left out where it moves with others by less than an error of constants: an
+    effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample. Of an effect
+    that is a curve this is the standard deviation.
     """
-    own, text, found = parts(run), run.time_text, []
+    names, text, found = [*run.model.names, *curve], run.time_text, []
+    of, bent = np.array([_what(name) for name in names]), {_what(name) for name in curve}
+    means = {"level": np.mean(rows.phi[:, run.model.n :], axis=0)}
+    own = {what: np.append(x, means.get(what, 0.0 * means["level"])) for what, x in parts(run).items()}
+    theta = pseudo_inverse(rows.phi) @ rows.y
+    rms = root_mean_square(rows.y - rows.phi @ theta)
 
     def value(what: str, theta: Array) -> float:
         memory = own["memory"] @ theta
-        return float(own[what] @ theta / (1.0 if what == "memory" or root or memory >= 1.0 else 1.0 - memory))
+        rest = 1.0 if what == "memory" or root or memory >= 1.0 else 1.0 - memory
+        mine = of == what
+        return float((np.std(rows.phi[:, mine] @ theta[mine]) if what in bent else own[what] @ theta) / rest)
 
     def changed(theta: Array, to: dict[str, float]) -> Array:
-        return np.array([to.get(name, theta[i]) for i, name in enumerate(run.model.names)])
+        return np.array([to.get(name, theta[i]) for i, name in enumerate(names)])
 
-    for event in reversed(verdict.events):
+    for event in reversed(happened):
         theta = changed(theta, {move.name: move.before for move in event.moves})
-    for event in verdict.events:
+    for event in happened:
         after = changed(theta, {move.name: move.after for move in event.moves})
         instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
         ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
         touched = {_what(move.name) for move in event.moves}
         for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
             values = value(what, theta), value(what, after)
-            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > verdict.rms:
-                found.append(Move(what, event.kind, *values, *ends, event.at, instead))
+            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > rms:
+                found.append(Move(what, event.kind, *values, *ends, event.at, instead, what in bent))
         theta = theta if event.kind == "temporary" else after
     return tuple(found)
 

@@ -117,7 +117,10 @@ def _event(answer: Identification, own: list[Move]) -> str:
     one, output = own[0], answer.roles.output
     whats = {"memory": f"the memory of {output} (sum of its lags)", "level": f"the level of {output} (at mean inputs)"}
     whats |= {name: f"the effect of {name} on {output} ({delay(answer, name)})" for name in answer.model.input_names}
-    parts = (f"{whats[move.what]} {verb(move)} from {number(move.before)} to {number(move.after)}" for move in own)
+    bent = {move.what: f"the curve of {move.what} on {output} (its standard deviation)" for move in own if move.bent}
+    parts = (
+        f"{(whats | bent)[move.what]} {verb(move)} from {number(move.before)} to {number(move.after)}" for move in own
+    )
     when = {"wandering": "over the whole record", "gradual": f"gradually from {one.first} to {one.last}"}
     date = f"on {one.first}" if one.first == one.last else f"between {one.first} and {one.last}"
     back = ", and was then as before" if one.kind == "temporary" else ""

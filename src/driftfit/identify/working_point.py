@@ -36,7 +36,7 @@ class Cause:
     that is used, with their standard errors.
 
     ``products``: what the curve is made of, in words; none where no curve leads. ``bent``: the input of which it is a
-    static curve, or -1.
+    static curve, or -1. ``of``: a name for each column, with the regressor that it bends.
     """
 
     tracked: tuple[float, float]
@@ -44,6 +44,7 @@ class Cause:
     joint: tuple[float, float]
     products: tuple[str, ...]
     bent: int
+    of: tuple[str, ...]
     columns: Array
     """(N, k): the products."""
 
@@ -56,7 +57,7 @@ class Cause:
         return "both" if self.joint[0] - self.tracked[0] > CLEAR else "time"
 
 
-def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
+def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, str, int]]) -> Cause:
     """Compare the four descriptions of y (N,) on phi (N, n), the constant last, and `products` Z (N, q)."""
     X = np.column_stack([phi[:, -1], phi[:, :-1], Z])
     rows, base = np.isfinite(X).all(axis=1), list(range(phi.shape[1]))
@@ -70,15 +71,17 @@ def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
     (curve, one), (joint, other) = (lead(scores.terms(bent), constants) for scores in (steady, moving))
     price *= len(chosen)
     leads = lead(moving.terms(base), constants), (curve - price, one), (joint - price, other)
-    own = {made[one][1] for one in chosen}
+    own = {made[one][2] for one in chosen}
     words = tuple(dict.fromkeys(made[one][0] for one in chosen))
-    return Cause(*leads, words, own.pop() if len(own) == 1 else -1, Z[:, chosen])
+    of = tuple(f"{k}{made[one][1]}" for k, one in enumerate(chosen))
+    return Cause(*leads, words, own.pop() if len(own) == 1 else -1, of, Z[:, chosen])
 
 
 def products(
     y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int
-) -> tuple[Array, list[tuple[str, int]]]:
-    """(T, q) products of signals on a grid; for each words and the input that is bent, -1 for one of two signals."""
+) -> tuple[Array, list[tuple[str, str, int]]]:
+    """(T, q) products of signals on a grid; for each words, "[input]" or "" for a lag of the output, and the input that
+    is bent, -1 for one of two signals."""
     past, inputs = filled(y), [filled(u) for u in U.T]
     slow = np.convolve(np.where(np.isfinite(past), past, np.nanmean(past)), np.full(SLOW, 1.0 / SLOW))[: len(y)]
     slow[: SLOW - 1] = np.nan
@@ -86,9 +89,10 @@ def products(
     signals += [(names[i], moved(x, first)) for i, x in enumerate(inputs)]
     xs = [(names[j], j, moved(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
     xs += [(output, -1, moved(past, 1))] if structure.na else []
-    made = [(f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
+    of = {name: f"[{name}]" for name in names}
+    made = [(f"a bend of {name} at {q:.3g}", of.get(name, ""), j, np.maximum(x - q, 0.0))
             for name, j, x in xs for q in np.nanquantile(x, (0.25, 0.5, 0.75))]  # fmt: skip
-    made += [(f"{name} times {other}", -1, x * bend)
+    made += [(f"{name} times {other}", of.get(name, ""), -1, x * bend)
              for name, _, x in xs for other, w in signals if not np.array_equal(w, x, equal_nan=True)
              for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))]  # fmt: skip
-    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, j) for text, j, _ in made]
+    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(a, b, j) for a, b, j, _ in made]
