@@ -201,8 +201,9 @@ class _Task:
         if kind == "both" and again is not None:
             told, curve = curved, why_not.of
             happened = events(again, [*model.names, *curve], told.at, run.time_text)
-        return Identification(kind, why, model, run, verdict, found, structure, why_not, own,
-                              moves(happened, run, told, curve, memory.root), memory, errors_of(known, self.horizon), _notes(found, run, y, U, structure),
+        moved = moves(happened, run, told, curve, memory.root)
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory,
+                              errors_of(known, self.horizon), _notes(found, run, y, U, structure),
                               _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
 
 
