@@ -20,8 +20,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.identify.judgement import effects, errors_of, feedback, moves, with_lags
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
-from driftfit.identify.roles import NoAnswerError, Roles, roles
-from driftfit.identify.scores import FEWEST
+from driftfit.identify.roles import Roles, roles
 from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.changes.words import events
@@ -52,14 +51,11 @@ def identify(
     Parameters
     ----------
     data : table, mapping of columns, path, pattern or list of paths
-    y : name of the output
-        It may be left out if only one column of numbers is left.
-    u, not_u : names
-        The inputs to choose from, and columns that are none. By default every other column of numbers.
-    time, by : names
-        The column of the time, and the one that identifies records; found if not given.
-    dt : number or text
-        Nominal interval, as for `track`; the median by default.
+    y, u, not_u : names
+        The output, which may be left out if only one column of numbers is left; the inputs to choose from, by default
+        every other column of numbers; columns that are none.
+    time, dt, by : names, number or text
+        The column of the time, its nominal interval, the column that identifies records; found if not given.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
     max_lag, horizon : int
@@ -83,7 +79,7 @@ def identify(
     ValueError
         For columns that do not exist, an output that is not named and not obvious, and what `track` does not accept.
     driftfit.identify.roles.NoAnswerError
-        For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
+        For a record that cannot answer: fewer than 60 rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
     max_lag, horizon = whole("identify", "max_lag", max_lag, 1), whole("identify", "horizon", horizon, 1)
@@ -92,7 +88,6 @@ def identify(
     progress("reading")
     found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
                   wanted=reading)  # fmt: skip
-    check_record(found)
     source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
@@ -109,19 +104,9 @@ def identify(
     return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure))
 
 
-def check_record(found: Roles) -> None:
-    """NoAnswerError for a record that no structure can answer."""
-    known = found.y[np.isfinite(found.y)]
-    if len(known) < FEWEST:
-        raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
-    if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
-        raise NoAnswerError(f"{found.output} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
-
-
 def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
     """Roles and structure alone, with the defaults of `identify`."""
     found = roles(data, y, time=time, wanted=reading)
-    check_record(found)
     return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False).shape)
 
 
@@ -181,7 +166,7 @@ class _Task:
         besides, again = bool(verdict.drifts), None
         if besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
-            curved = more.only(np.isfinite(more.phi).all(axis=1), range(more.phi.shape[1]))
+            curved = more.only(np.flatnonzero(np.isfinite(more.phi).all(axis=1)), range(more.phi.shape[1]))
             again = judged_rows(curved, self.level)
             besides = again is None or again.rejected
         others = (
@@ -197,7 +182,7 @@ class _Task:
             why += "if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
-        happened, told, curve = verdict.events if kind in ("moves", "both") else (), rows, ()
+        happened, told, curve = verdict.events if kind in ("moves", "both") else (), rows, why_not.of[:0]
         if kind == "both" and again is not None:
             told, curve = curved, why_not.of
             happened = events(again, [*model.names, *curve], told.at, run.time_text)

@@ -86,28 +86,24 @@ class Move(NamedTuple):
     bent: bool = False
 
 
-def weights(first: Array, second: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample, from their errors (T,)."""
-    known = np.isfinite(first) & np.isfinite(second)
-    squares = np.where(known, np.square([first, second]), 0.0)
+def mixed(y: Array, errors: Array, h: int) -> Array:
+    """Errors (T,) of the mixture of two predictions h steps ahead of y (T,), from their errors (2, T)."""
+    past = moved(y, h)
+    low, high = np.fmin.accumulate(past), np.fmax.accumulate(past)
+    e = y - np.clip(y - errors, 2.0 * low - high, 2.0 * high - low)
+    known = np.isfinite(e).all(axis=0)
+    squares = np.where(known, e**2, 0.0)
     before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
     v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
     with np.errstate(over="ignore"):
         worth = np.where(count > LEAST, (squares[1] - squares[0]) / (2.0 * v), 0.0)
-    now, found = 0.5, []
+    weights = [0.5] * h
     for ratio in np.exp(np.clip(worth, -50.0, 50.0)).tolist():
-        found.append(now)
-        now = SHARE + (1.0 - 2.0 * SHARE) * now * ratio / (1.0 - now + now * ratio)
-    return np.array(found)
-
-
-def mixed(y: Array, first: Array, second: Array, h: int) -> Array:
-    """Errors (T,) of the mixture of two predictions h steps ahead of y (T,), from their errors (T,)."""
-    past = moved(y, h)
-    low, high = np.fmin.accumulate(past), np.fmax.accumulate(past)
-    first, second = (y - np.clip(y - e, 2.0 * low - high, 2.0 * high - low) for e in (first, second))
-    w = np.append(np.full(h - 1, 0.5), weights(first, second))[: len(y)]
-    return w * first + (1.0 - w) * second
+        w = weights[-1]
+        weights.append(SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (1.0 - w + w * ratio))
+    w = np.array(weights[: len(y)])
+    found: Array = w * e[0] + (1.0 - w) * e[1]
+    return found
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
@@ -117,11 +113,11 @@ def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
     far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
-    cases = [(1, own.tracked, own.constant_ls, rivals)]
+    cases = [(1, [own.tracked, own.constant_ls], rivals)]
     if horizon > 1:
-        cases.append((horizon, *far, {"persistence": y - moved(persistence(y), horizon - 1)}))
-    for h, tracked, constants, others in cases:
-        errors = {"driftfit": mixed(y, tracked, constants, h), "tracked": tracked, "constants": constants, **others}
+        cases.append((horizon, far, {"persistence": y - moved(persistence(y), horizon - 1)}))
+    for h, both, others in cases:
+        errors = {"driftfit": mixed(y, np.stack(both), h), "tracked": both[0], "constants": both[1], **others}
         at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
         found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
     return tuple(found)

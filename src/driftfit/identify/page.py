@@ -23,7 +23,6 @@ from driftfit.identify.judgement import Effect, Errors, Memory, Move
 from driftfit.identify.roles import Roles
 from driftfit.identify.structure import TIED, Shape, Structure
 from driftfit.identify.working_point import Cause
-from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, p_equals
 from driftfit.models.arx import ARX, arx_text
@@ -51,11 +50,9 @@ PROPERTIES: dict[str, Any] = {
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
 RECORD = {"moves": {"type": ["boolean", "null"]}, "p": PROPERTIES["p"], "q": PROPERTIES["p"]}
-RECORDS: dict[str, Any] = {
-    "schema": {"const": f"{NAME}/records"},
-    **{key: PROPERTIES[key] for key in ("headline", "model", "roles", "notes")},
+RECORDS = {key: PROPERTIES[key] for key in ("headline", "model", "roles", "notes")} | {
+    "schema": {"const": f"{NAME}/records"}, "worst": {"type": "object", "additionalProperties": SCHEMA},
     "records": {"type": "object", "additionalProperties": {"type": "object", "properties": RECORD}},
-    "worst": {"type": "object", "additionalProperties": SCHEMA},
 }  # fmt: skip
 SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": list(RECORDS), "properties": RECORDS}
 """JSON Schema of `ManyIdentified.json`."""
@@ -193,13 +190,17 @@ def unit(answer: Identification) -> str:
     return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
 
 
+def effect(answer: Identification, one: Effect) -> str:
+    """The size of an effect, and whether it moves."""
+    moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
+    size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
+    return f"{size}, {delay(answer, one.name)}{moved}"
+
+
 def lines(answer: Identification) -> list[tuple[str, str]]:
     """The lines of the terminal, each with its style."""
     found = [("bold", line) for line in wrap(conclusion(answer), WIDTH - 1)]
-    for one in answer.effects:
-        moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-        size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
-        found.append(("", f"{one.name:<20} {size}, {delay(answer, one.name)}{moved}"))
+    found += [("", f"{one.name:<20} {effect(answer, one)}") for one in answer.effects]
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
@@ -279,9 +280,11 @@ def body(answer: Identification) -> list[str]:
         signals = f"RLS(1.0), y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
         curve = f"<p>That curve, fitted:</p><pre>{escape(f'track({answer.curve.model!r}, {signals})')}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
+    each = (f"{one.name}: {effect(answer, one)}; smallest change that would have been found {number(one.least)}"
+            for one in answer.effects)  # fmt: skip
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
-        section("What, since when, how large", _listed(sentences(answer)) + _effects(answer)),
+        section("What, since when, how large", _listed([*sentences(answer), *each])),
         section("The picture", picture(figure(answer), answer.track, CAPTION)),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
@@ -294,13 +297,6 @@ def body(answer: Identification) -> list[str]:
 
 def _listed(sentences: Any) -> str:
     return points([escape(one) for one in sentences])
-
-
-def _effects(answer: Identification) -> str:
-    rows = [(escape(name), delay(answer, name), number(gain) + escape(units(answer, name)), f"{std:.2g}", number(least))
-            for name, gain, std, least in answer.effects]  # fmt: skip
-    heads = ("input", "delay", answer.effect, "+-", "smallest change found")
-    return table("Effects with constant parameters, in units of the output per unit of the input.", heads, rows, (1,))
 
 
 def _errors(answer: Identification) -> str:
@@ -370,17 +366,10 @@ class Identification(Printed):
         return "effect in a sample" if self.memory.root else lasting
 
     @cached_property
-    def alarms(self) -> Alarms:
-        """Alarms whose reference is what followed the last change; ``alarms.rule`` is armed from now on."""
-        last, T = max((move.at for move in self.moves), default=0), len(self.track)
-        start = last if T - last > T // 4 else 3 * T // 4
-        return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
-
-    @cached_property
     def curve(self) -> Track:
-        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several, with constants."""
-        model, bent = self.model, self.cause.bent
-        bases = [Polynomial(3) if bent < 0 or name == self.roles.inputs[bent] else None for name in model.input_names]
+        """A Hammerstein-Wiener model with constants and a curve of each input that bends, of all if the output does."""
+        model, bent = self.model, "".join(self.cause.of)
+        bases = [Polynomial(3) if f"[{name}]" in bent or "[" not in bent else None for name in model.input_names]
         nb, nk = zip(*model.lags, strict=True)
         curved = HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
         fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))

@@ -22,6 +22,7 @@ from driftfit.data.columns import FILE, Wanted, numbers_of, times_of_column
 from driftfit.data.files import paths_of, read_file, table_frame
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
+from driftfit.identify.scores import FEWEST
 from driftfit.readings.screen import apart
 
 SWITCHES = 0.02
@@ -159,6 +160,11 @@ def roles(
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}
     missing = int(np.sum(~np.isfinite(numbers[y])) + np.sum(~np.isfinite(U))) - sum(refused.values())
+    known = numbers[y][np.isfinite(numbers[y])]
+    if len(known) < FEWEST:
+        raise NoAnswerError(f"{len(known)} of {len(frame)} rows hold {y}; at least {FEWEST} are needed.")
+    if not _moves(known):
+        raise NoAnswerError(f"{y} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
     found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units, zone)
     return _in_order(found)
 

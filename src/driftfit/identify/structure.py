@@ -169,16 +169,15 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     doubtful = tuple(j for j, _, _ in shape[1] if monotonic() < end and not _beats_copies(y, U, shape, j, rng))
     if doubtful:  # the others may need other lags without them
         shape = without(pool.climb(without(shape, doubtful), end), doubtful)
-    idle = [j for j in range(pool.m) if all(one[0] != j for one in shape[1])]
-    if idle:
-        V, known = U.copy(), np.where(np.isfinite(U), U, np.nan)
-        V[:, idle] = (U - np.nanmedian(known, axis=0))[:, idle] ** 2
-        even = Pool(y, V, M, first)
-        even.scores.refer(even.columns(shape))
-        other = even.simplest(even.climb(without(shape, doubtful), end))
-        found = [j for j, _, _ in other[1] if j in idle]
-        if found and all(_beats_copies(y, V, other, j, rng) for j in found):
-            pool, shape, U = even, other, V
+    used = [j for j, _, _ in shape[1]]
+    squares = (U - np.nanmedian(np.where(np.isfinite(U), U, np.nan), axis=0)) ** 2
+    squares[:, used] = U[:, used]
+    even = Pool(y, squares, M, first)
+    even.scores.refer(even.columns(shape))
+    other = even.simplest(even.climb(without(shape, doubtful), end))
+    found = [j for j, _, _ in other[1] if j not in used]
+    if found and all(_beats_copies(y, squares, other, j, rng) for j in found):
+        pool, shape, U = even, other, squares
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
     return _told(pool, shape, doubtful, _of_log(pool, shape, y, U, first), narrowed)
 
