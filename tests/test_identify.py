@@ -89,6 +89,8 @@ def test_keys_clocks_that_run_back_and_gaps():
     twice = TABLE | {"clock": ROWS % 150}
     found = roles(twice | {"pump": ["b"] * 150 + ["a"] * 150}, "flow", time="clock")
     assert (found.by, found.groups.max()) == ("pump", 1)
+    states = roles(TABLE | {"clock": ROWS, "state": ["on", "off"] * 150}, "flow")
+    assert (states.by, states.why["state"]) == (None, "text")  # of one plant
     assert roles({"flow": PRESSURE, "name": ["x"] * 300}).output == "flow"  # the only column of numbers
     assert roles(twice, "flow", time="clock").key[-1] == "record 2"
     y, U, place = roles(TABLE | {"clock": ROWS + 3.0 * (ROWS > 100)}, "flow").spread(10)

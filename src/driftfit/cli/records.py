@@ -420,5 +420,5 @@ def identify_command(
         text = json.dumps(found.json(), indent=1)
         typer.echo(text) if str(json_to) == "-" else json_to.write_text(text, encoding="utf-8")
     if str(json_to) != "-":
-        say(" ".join(found.headline.split()) if quiet else found)
+        say(" ".join(found.headline.split()) if quiet else found, soft_wrap=quiet)
     raise typer.Exit(found.code)

@@ -8,6 +8,7 @@ columns of lags, O(T p^2) for the search, and that of up to four verdicts.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -20,7 +21,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.identify.judgement import effects, errors_of, feedback, moves, with_lags
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
-from driftfit.identify.roles import Roles, roles
+from driftfit.identify.roles import BACK, Roles, roles
 from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.changes.words import events
@@ -88,7 +89,8 @@ def identify(
     progress("reading")
     found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
                   wanted=reading)  # fmt: skip
-    source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
+    paths = [data] if isinstance(data, str) or hasattr(data, "__fspath__") else data if isinstance(data, list) else []
+    source = tuple(map(str, paths)) or ("data.csv",)
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
     model = model_of(found, structure.shape)
@@ -97,10 +99,11 @@ def identify(
         return task.judged(found, structure)
     progress("tracking")
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
-    verdicts, worst = fleet.verdict(level), {}
+    verdicts, worst, by = fleet.verdict(level), {}, "" if found.by == BACK else f" --by {shlex.quote(found.by)}"
     for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
         at = np.flatnonzero([one == key for one in found.key])
-        worst[key] = task.judged(replace(found.rows(at), by=None), structure)
+        own = replace(found.rows(at), by=None, options=found.options + by)
+        worst[key] = task.judged(own, structure)
     return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure))
 
 
@@ -127,7 +130,7 @@ class _Task:
     gate: bool | None = None
     seed: int = 0
     progress: Callable[[str], None] = lambda text: None
-    source: str = ""
+    source: tuple[str, ...] = ("data.csv",)
 
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""

@@ -36,7 +36,7 @@ from driftfit.use.simulate import moved, steps_ahead
 SHARE = 0.001
 """Probability that the other of two predictions is the better one from the next sample on."""
 FOUND = 6.7
-"""Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
+"""Standard errors of a coefficient that a change half-way must have to be found with 80 % probability: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
 
 
@@ -50,7 +50,7 @@ class Errors(NamedTuple):
 
 class Effect(NamedTuple):
     """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, with a unit
-    root; without inputs the level. Its standard error; the change half-way that is found in 4 of 5 records.
+    root; without inputs the level. Its standard error; the change half-way that is found with 80 % probability.
     """
 
     name: str
@@ -101,8 +101,8 @@ def mixed(y: Array, errors: Array, h: int) -> Array:
     for ratio in np.exp(np.clip(worth, -50.0, 50.0)).tolist():
         w = weights[-1]
         weights.append(SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (1.0 - w + w * ratio))
-    w = np.array(weights[: len(y)])
-    found: Array = w * e[0] + (1.0 - w) * e[1]
+    share = np.array(weights[: len(y)])
+    found: Array = share * e[0] + (1.0 - share) * e[1]
     return found
 
 

@@ -84,7 +84,7 @@ def conclusion(answer: Identification) -> str:
         return f"A static curve explains it, nothing moves in time: {curve(answer)}."
     if answer.kind == "no drift found":
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
-        seen = f"In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
+        seen = f"The smallest change of the {answer.effect}, half-way, that is found with 80 % probability: {least}."
         return f"No drift found in {output} ({p_equals(answer.verdict.p)}). {seen}"
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
@@ -172,8 +172,11 @@ def commands(answer: Identification) -> list[str]:
     each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
     given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
-    served = f"driftfit serve {shlex.quote(PurePath(answer.source).stem)}.toml   # the unit is on the page"
-    return [*(f"driftfit {verb} {shlex.quote(answer.source)} {given}" for verb in ("track", "detect")), served]
+    served = f"driftfit serve {shlex.quote(PurePath(answer.source[0]).stem)}.toml   # with the unit that --page shows"
+    return [
+        *(f"driftfit {verb} {shlex.join(answer.source)} {given}{roles.options}" for verb in ("track", "detect")),
+        served,
+    ]
 
 
 def interval(roles: Roles) -> str:
@@ -183,7 +186,7 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    own = dict[str, Any](name=PurePath(answer.source).stem, y=answer.roles.output, u=answer.model.input_names)
+    own = dict[str, Any](name=PurePath(answer.source[0]).stem, y=answer.roles.output, u=answer.model.input_names)
     own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
@@ -266,7 +269,7 @@ def figure(answer: Identification) -> Figure:
 def html(answer: Identification, path: Any = None) -> str:
     """The answer as one self-contained HTML page; with a ``path`` it is written there."""
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
-    subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
+    subtitle = escape(f"{', '.join(answer.source)}, {len(answer.track)} samples, answer: {answer.kind}")
     first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([conclusion(answer)])}'
     return written(document(heading, [first, *body(answer)]), path)
 
@@ -305,7 +308,7 @@ def _errors(answer: Identification) -> str:
         style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
         cells = (f"<span{style[name]}>{rms[name]:.4g}</span>" if name in rms else "" for name in heads)
         rows.append((f"{steps} ahead", *cells, str(samples)))
-    caption = "Root mean square errors of predictions made before the sample, tracked and constants mixed. Red: lower."
+    caption = "Root mean square errors of predictions made before the sample; driftfit mixes tracked and constants. Red: lower."
     return table(caption, ("", *heads, "samples"), rows)
 
 
@@ -352,7 +355,7 @@ class Identification(Printed):
     errors: tuple[Errors, ...]
     notes: tuple[str, ...]
     undecided: tuple[str, ...]
-    source: str
+    source: tuple[str, ...]
 
     @property
     def code(self) -> int:
@@ -419,4 +422,4 @@ class ManyIdentified(Printed):
         yield Text("\n".join(f" {line}" for text in (*columns(self.roles), data) for line in wrap(text, WIDTH - 1)))
         yield self.verdict
         for key, one in self.worst.items():
-            yield Text(f"\n {key}: {one.headline}")
+            yield Text("\n " + "\n ".join(wrap(f"{key}: {one.headline}", WIDTH - 1)))

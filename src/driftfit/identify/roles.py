@@ -1,16 +1,18 @@
 """Roles: what each column of a table is, so that y, u, time and key need not be given.
 
 The time holds dates, or, where no column does, is the first whose numbers increase by even steps. The key is text with
-few values, or tells the records between which the clock runs back. A label is 0 or 1 and changes at less than
-`SWITCHES` of the rows, as an operator's mark of a fault. Inputs are the other columns of numbers, without constants,
-copies, second clocks and what is mostly empty. Fault codes and spikes are missing, in inputs as in y
-(`driftfit.readings.screen.apart`).
+few values, whose records follow each other or share their times, or tells the records between which the clock runs
+back. A label is 0 or 1 and changes at less than `SWITCHES` of the rows, as an operator's mark of a fault. Inputs are
+the other columns of numbers, without constants, copies, second clocks and what is mostly empty. Fault codes and spikes
+are missing, in inputs as in y (`driftfit.readings.screen.apart`).
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import narwhals as nw
@@ -26,6 +28,7 @@ from driftfit.identify.scores import FEWEST
 from driftfit.readings.screen import apart
 
 SWITCHES = 0.02
+BACK = "the clock, which runs back"
 ALIKE = 1e-6
 """How far below 1 the correlation of two copies may be."""
 
@@ -39,7 +42,8 @@ class Roles:
     """The columns, and the record: y (T,), U (T, m), time (T,) or None, key of every row.
 
     ``dt``: nominal interval, as for `track`. ``why``: why a column is no input. ``refused``: readings taken as
-    missing, by column. ``missing``: readings that were missing already.
+    missing, by column. ``missing``: readings that were missing already. ``options``: how
+    the file was read, as options of the command.
     """
 
     output: str
@@ -55,6 +59,7 @@ class Roles:
     refused: Mapping[str, int] = field(default_factory=dict)
     missing: int = 0
     units: Mapping[str, str] = field(default_factory=dict)
+    options: str = ""
     zone: str | None = None
 
     @property
@@ -141,7 +146,9 @@ def roles(
             raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(left)}.")
         y = left[0]
     if worded := [name for name in (y, *(u or ())) if name not in numbers]:
-        raise NoAnswerError(f"{worded[0]} holds text, such as {frame[worded[0]][0]!r}; numbers are needed.")
+        cell = str(frame[worded[0]][0])
+        hint = " (--decimal , reads decimal commas)" if "," in cell else ""
+        raise NoAnswerError(f"{worded[0]} holds text, such as {cell!r}; numbers are needed{hint}.")
     refused, kept = {}, list(u or ())
     for name in {*left, y, *kept} & numbers.keys():
         low, high = (limits or {}).get(name) or (None, None)
@@ -165,8 +172,19 @@ def roles(
         raise NoAnswerError(f"{len(known)} of {len(frame)} rows hold {y}; at least {FEWEST} are needed.")
     if not _moves(known):
         raise NoAnswerError(f"{y} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
-    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units, zone)
+    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units,
+                  _options(wanted or Wanted(()), limits or {}), zone)  # fmt: skip
     return _in_order(found)
+
+
+def _options(wanted: Wanted, limits: Mapping[str, tuple[float | None, float | None]]) -> str:
+    """How a file was read, as options of the command."""
+    given = [("decimal", wanted.decimal)] if wanted.decimal != "." else []
+    given += [(name, text) for name in ("separator", "dates") if (text := getattr(wanted, name))]
+    given += [("missing", text) for text in wanted.missing]
+    ends = {name: ["" if one is None else f"{one:g}" for one in both] for name, both in limits.items()}
+    given += [("limits", f"{name}={low}:{high}") for name, (low, high) in ends.items()]
+    return "".join(f" --{name} {shlex.quote(text)}" for name, text in given)
 
 
 def _in_order(found: Roles) -> Roles:
@@ -256,13 +274,19 @@ def _reason(numbers: Mapping[str, Array], name: str, others: Iterable[str]) -> s
 
 
 def _key(frame: Any, texts: Sequence[str], by: str | None, axis: Array | None) -> tuple[tuple[Any, ...], str | None]:
-    """(key of every row, name of the column): given, of text with few values, or where the clock runs back."""
-    count = {name: len(set(frame[name].to_list())) for name in texts}
-    few = [name for name in texts if 2 <= count[name] <= len(frame) // 30]
+    """(key of every row, name of the column): given, of text with few values, or where the clock runs back.
+
+    Text that changes to and fro in one time is a state of one plant, and no key.
+    """
+    cells = {name: frame[name].to_list() for name in texts}
+    count = {name: len(set(column)) for name, column in cells.items()}
+    together = axis is not None and len(np.unique(axis)) < len(axis)
+    few = [name for name, column in cells.items() if 2 <= count[name] <= len(frame) // 30
+           and (together or sum(a != b for a, b in pairwise(column)) < count[name])]  # fmt: skip
     by = by or max(few, key=lambda name: count[name], default=None)
     if by is not None:
         return tuple(frame[by].to_list()), by
     back = np.append(False, axis[1:] < axis[:-1]) if axis is not None else np.zeros(len(frame), bool)
     if 0 < back.sum() <= len(frame) // 100:
-        return tuple(f"record {k + 1}" for k in np.cumsum(back)), "record"
+        return tuple(f"record {k + 1}" for k in np.cumsum(back)), BACK
     return (0,) * len(frame), None
