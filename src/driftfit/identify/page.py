@@ -308,7 +308,7 @@ def _errors(answer: Identification) -> str:
         style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
         cells = (f"<span{style[name]}>{rms[name]:.4g}</span>" if name in rms else "" for name in heads)
         rows.append((f"{steps} ahead", *cells, str(samples)))
-    caption = "Root mean square errors of predictions made before the sample; driftfit mixes tracked and constants. Red: lower."
+    caption = "Root mean square errors of predictions before the sample; driftfit mixes both of the next. Red: lower."
     return table(caption, ("", *heads, "samples"), rows)
 
 
