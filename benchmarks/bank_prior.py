@@ -74,7 +74,7 @@ def scores(banks: Mapping[str, Bank], size: float, rate: float, records: int) ->
     found = {}
     for name, bank in banks.items():
         each = [score(one, track(Regression(N), bank, one.y, one.phi, keep="cov")) for one in made]
-        square, nees, near, log_p = np.nanmean(each, axis=0)
+        square, nees, near, log_p = np.ma.masked_invalid(each).mean(axis=0).filled(np.nan)
         found[name] = np.sqrt(square / least), nees, near, log_p
     return found
 

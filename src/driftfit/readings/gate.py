@@ -15,7 +15,8 @@ pulse, may be FAR times as large as predicted. A far reading is refused. A chang
     pulses     of far responses to rare pulses, and of readings far from a signal that never moved, the third is
                believed, whatever lies between
     codes      come in runs: a far reading that repeats one of the last two far ones in all digits, with either sign,
-               is not counted, and believed only with the `hold`-th
+               is not counted, and believed only with the `hold`-th; with `LONGER` times as many if the forecast moved
+               meanwhile, so that a level would not have repeated, and readings do not repeat by nature
 
 s = inf or NaN (start) contradicts nothing, a tracker without s is lent the mean of e^2, and a sample without a forecast
 is judged by v alone. v counts a reading that contradicts its forecast as `CLIPPED` variances at most, so that spikes do
@@ -50,6 +51,8 @@ MEMORY = 1000.0
 """Their memory, in readings; exponential."""
 CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
+LONGER = 4
+"""Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
 SIGNAL = 8
@@ -129,7 +132,8 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+            moved = (s.gate_stuck[l] > 0.5) & (not natural(s, l))
+            return (s.gate_same[l] < (LONGER * hold if moved else hold)) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
         s.gate_run[l] += 2
         s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
