@@ -93,6 +93,8 @@ def test_keys_clocks_that_run_back_and_gaps():
     assert (states.by, states.why["state"]) == (None, "text")  # of one plant
     assert roles({"flow": PRESSURE, "name": ["x"] * 300}).output == "flow"  # the only column of numbers
     assert roles(twice, "flow", time="clock").key[-1] == "record 2"
+    late = roles({name: [*x, x[5]] for name, x in (TABLE | {"clock": ROWS}).items()}, "flow")
+    assert (late.by, late.dropped, len(late.y)) == (None, 1, 300)
     y, U, place = roles(TABLE | {"clock": ROWS + 3.0 * (ROWS > 100)}, "flow").spread(10)
     assert (len(y), place[101]) == (303, 104)
     assert np.isinf(np.column_stack([y, U])[101:104]).all()
@@ -144,6 +146,13 @@ def test_the_logarithm_of_the_output_is_compared_on_its_scale():
     assert searched(y, U).log == (0.0, 0.0)
 
 
+def test_inputs_that_together_replace_another_are_named():
+    one, other, noise = np.random.default_rng(6).normal(size=(3, T))
+    y = moved(one + other, 2) + noise
+    found = searched(y, np.column_stack([one + other, one, other]))
+    assert [(j, sorted(of)) for j, of in found.instead] == [(0, [1, 2])]
+
+
 def test_a_slow_input_that_is_no_better_than_its_copies_is_left_out():
     rng = np.random.default_rng(11)
     walk, other = np.cumsum(rng.normal(size=(2, T)), axis=1)
@@ -168,10 +177,20 @@ def test_track_without_a_model_takes_that_of_identify():
     assert "2026-03-03" in result.output
 
 
-def test_lines_to_copy_run(pump):
-    for line in commands(pump)[:2]:
+def test_lines_to_copy_run(pump, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = [part for line in commands(pump) for part in line.split(" && ")]
+    for line in [*lines[:-1], lines[-1] + " --check"]:
         result = CliRunner().invoke(app, shlex.split(line)[1:])
         assert result.exit_code == 0, result.output
+
+
+def test_a_stream_continues_the_record_with_an_alarm(pump):
+    stream = pump.live()
+    assert (len(stream.theta), stream.alarms[0].rule.frozen != ()) == (pump.model.n, True)
+    for t in range(120):
+        stream.update(12.0 + (t >= 60), [3.0, 8.0], pump.track.time[-1] + np.timedelta64(10 * (t + 1), "s"))
+    assert stream.alarms[0].active
 
 
 def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
@@ -197,7 +216,8 @@ def test_the_answer_for_a_pump(pump):
     assert [one.steps for one in pump.errors] == [1, 10]
     assert pump.errors[0].rms["driftfit"] < 0.95 * pump.errors[0].rms["constants"]
     assert len(str(pump).splitlines()) <= 25
-    for said in ("pump (constant)", "driftfit detect", "Not needed: temperature, humidity"):
+    assert pump.headline.endswith("; speed matters and is constant; temperature, humidity do not matter.")
+    for said in ("pump (constant)", "driftfit detect"):
         assert said in str(pump)
 
 
@@ -229,6 +249,7 @@ def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
 CODES = {
     "no such column": (["--y", "flux"], 2, "no column 'flux'"),
     "no output named": ([], 2, "name the output with --y"),
+    "no numbers": (["--not-u", "flow,speed,pressure,temperature,humidity"], 3, "no column holds numbers that move"),
     "two outputs": (["--y", "flow,speed"], 2, "it explains one output; call it for flow and for speed"),
     "too few rows": (["--y", "flow", "--limits", "flow=0:11"], 3, "24 rows of 800 have all lags; at least 60"),
     "constant output": (["--y", "pump"], 3, "pump is 1 in all 800 rows"),
@@ -285,7 +306,7 @@ def test_records_with_one_structure(tmp_path, monkeypatch):
 
 def test_a_negative_effect_neither_rises_nor_falls():
     each = {(-1.9, -1.4): "weakened", (-1.4, -1.9): "grew stronger", (1.0, 2.0): "rose", (1.0, -1.0): "fell"}
-    assert {ends: verb(Move("u", "step", *ends, "", "", 0, ())) for ends in each} == each
+    assert {ends: verb(Move("u", "step", *ends, "", "", 0, 0, ())) for ends in each} == each
 
 
 def test_more_than_one_in_a_hundred_left_out_is_no_answer_unless_the_gate_is_asked_for(pump, tmp_path):

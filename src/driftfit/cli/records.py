@@ -33,6 +33,7 @@ from driftfit.cli.options import (
     reads,
 )
 from driftfit.cli.program import app, draw, progress, say, writable
+from driftfit.data.clock import Clock
 from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
 from driftfit.data.limits import marks as marks_of
@@ -42,7 +43,7 @@ from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
 from driftfit.identify.answer import chosen, identify
-from driftfit.identify.page import interval
+from driftfit.identify.page import SERVICE, interval, unit
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
@@ -359,6 +360,12 @@ def smooth(given: Given, write_to: Table = None, plot: Plot = None) -> None:
     draw(plot, smoothed.plot)
 
 
+def _seconds(text: str) -> float:
+    given = parse_interval(text, "--budget")
+    length = Clock.of(given).duration if isinstance(given, str) else None
+    return float(given or 0.0) if length is None else float(length / np.timedelta64(1, "s"))
+
+
 @app.command("identify")
 @reads
 def identify_command(
@@ -379,12 +386,13 @@ def identify_command(
         bool | None, Option("--gate/--no-gate", help="Leave out fault codes however many, or use all readings.")
     ] = None,
     budget: Annotated[
-        float,
-        Option(help="Seconds.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))),
-    ] = 45.0,
+        str,
+        Option(help="Seconds, or a duration such as 2min.", metavar="SECONDS"),
+    ] = "45s",
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
     page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
     json_to: Annotated[Path | None, Option("--json", help="Write the answer as JSON; - is stdout.")] = None,
+    serve: Annotated[Path | None, Option(help="Write a configuration for `driftfit serve` (.toml).")] = None,
     quiet: Annotated[bool, Option("--quiet", help="Print the headline alone.")] = False,
 ) -> None:
     """From a file to an answer: which inputs matter, what changed, since when, and is it time or the working point?
@@ -407,7 +415,7 @@ def identify_command(
                 file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=cells.time,
                 dt=parse_interval(cells.dt), by=by, limits=ranges,
                 max_lag=max_lag, forecast=forecast, horizon=horizon, level=level, gate=gate,
-                budget=budget, seed=seed, reading=cells.wanted, progress=tell,
+                budget=_seconds(budget), seed=seed, reading=cells.wanted, progress=tell,
             )  # fmt: skip
         except NoAnswerError as error:
             status.stop()
@@ -416,6 +424,8 @@ def identify_command(
             raise typer.Exit(3) from None
     if page is not None:
         found.page(page)
+    if serve is not None:
+        serve.write_text(SERVICE + unit(found), encoding="utf-8")
     if json_to is not None:
         text = json.dumps(found.json(), indent=1)
         typer.echo(text) if str(json_to) == "-" else json_to.write_text(text, encoding="utf-8")

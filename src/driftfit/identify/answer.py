@@ -91,6 +91,7 @@ def identify(
                   wanted=reading)  # fmt: skip
     paths = [data] if isinstance(data, str) or hasattr(data, "__fspath__") else data if isinstance(data, list) else []
     source = tuple(map(str, paths)) or ("data.csv",)
+    found = replace(found, options=found.options + ("" if gate is None else " --gate" if gate else " --no-gate"))
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
     model = model_of(found, structure.shape)
@@ -104,7 +105,7 @@ def identify(
         at = np.flatnonzero([one == key for one in found.key])
         own = replace(found.rows(at), by=None, options=found.options + by)
         worst[key] = task.judged(own, structure)
-    return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure))
+    return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure), source)
 
 
 def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
@@ -213,6 +214,7 @@ def _of_data(found: Roles, structure: Structure) -> tuple[str, ...]:
         *([] if found.inputs else [f"no input moves, so only its own past can explain {found.output}"]),
         *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
         *([f"missing readings: {found.missing}"] if found.missing else []),
+        *([f"rows without a time of their own, left out: {found.dropped}"] if found.dropped else []),
         *([structure.narrowed] if structure.narrowed else []),
     )
 
@@ -222,7 +224,8 @@ def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> 
     return (
         *(f"the delay of {names[j]}: {low} to {high} samples are as good"
           for j, (low, high) in structure.delays.items() if low < high),
-        *(f"{names[j]} or {names[i]}: either explains the record" for j, i in structure.instead),
+        *(f"{names[j]} or {' with '.join(names[i] for i in of)}: either explains the record"
+          for j, of in structure.instead),
         *(f"{names[j]}: useful, but so are copies of it at other times" for j in structure.doubtful),
         *(["a level that wanders, or noise that does"] if verdict.nearly_walk else []),
     )  # fmt: skip

@@ -60,19 +60,21 @@ class Effect(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Sum of the lags of y with its standard error; ``root``: whether 1 is within two of them."""
+    """Sum of the lags of y with its standard error; ``root``: whether it may be 1, which is underestimated: the 5 %
+    point of Dickey and Fuller (1979) with an intercept.
+    """
 
     value: float
     std: float
 
     @property
     def root(self) -> bool:
-        return self.value + 2.0 * self.std >= 1.0
+        return self.value + 2.86 * self.std >= 1.0
 
 
 class Move(NamedTuple):
     """What an event did to one effect: the static gain of an input, or of a ``bent`` one the standard deviation; the
-    ``memory`` (sum of a) or the ``level``.
+    ``memory`` (sum of a) or the ``level``. It was over at the sample ``end``.
     """
 
     what: str
@@ -82,6 +84,7 @@ class Move(NamedTuple):
     first: str
     last: str
     at: int
+    end: int
     instead: tuple[str, ...]
     bent: bool = False
 
@@ -184,11 +187,11 @@ def moves(happened: Sequence[Event], run: Track, rows: Rows, curve: Sequence[str
         after = changed(theta, {move.name: move.after for move in event.moves})
         instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
         ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
-        touched = {_what(move.name) for move in event.moves}
+        touched, end = {_what(move.name) for move in event.moves}, event.until or event.latest
         for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
             values = value(what, theta), value(what, after)
             if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > rms:
-                found.append(Move(what, event.kind, *values, *ends, event.at, instead, what in bent))
+                found.append(Move(what, event.kind, *values, *ends, event.at, end, instead, what in bent))
         theta = theta if event.kind == "temporary" else after
     return tuple(found)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -29,10 +30,12 @@ from driftfit.models.arx import ARX, arx_text
 from driftfit.models.hammerstein_wiener.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.results import Track
+from driftfit.run.result import root_mean_square
 from driftfit.show.axes import BLUE, RED, date_axis, draw_prediction, frame, panels, settled, time_label
 from driftfit.show.page import document, opening, picture, points, section, table
 from driftfit.show.report import written
 from driftfit.show.text import WIDTH, Printed
+from driftfit.streams import Live
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 
@@ -56,6 +59,10 @@ RECORDS = {key: PROPERTIES[key] for key in ("headline", "model", "roles", "notes
 }  # fmt: skip
 SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": list(RECORDS), "properties": RECORDS}
 """JSON Schema of `ManyIdentified.json`."""
+SERVICE = '[source.web]\nkind = "http"\n\n'
+"""What a configuration of a service needs beside a unit: samples come by HTTP."""
+SPLIT = re.compile(r" (--model|--quiet)")
+"""Where a long line to copy is continued in the next."""
 CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
 its 95 % band, from the past only. Red: when it changed."""
 
@@ -89,8 +96,18 @@ def conclusion(answer: Identification) -> str:
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
     more = f"; and {len(said) - 2} more change{'' if len(said) == 3 else 's'}" if len(said) > 2 else ""
-    text = f"{'; '.join(said[:2])}{more}; tracking {gain}."
+    text = f"{'; '.join(said[:2])}{more}; tracking {gain}{''.join(others(answer))}."
     return (f"Both: {curve(answer)}. Besides this: " if answer.kind == "both" else "") + text[0].upper() + text[1:]
+
+
+def others(answer: Identification) -> list[str]:
+    """The inputs that matter and do not move, and those that do not matter."""
+    names, moving = answer.roles.inputs, {move.what for move in answer.moves}
+    steady = [names[j] for j in sorted(answer.structure.lags) if names[j] not in moving]
+    idle = [name for j, name in enumerate(names) if j not in answer.structure.lags]
+    matter, do = "matters and is" if len(steady) == 1 else "matter and are", "does" if len(idle) == 1 else "do"
+    said = (steady and f"; {', '.join(steady)} {matter} constant", idle and f"; {', '.join(idle)} {do} not matter")
+    return [one for one in said if one]
 
 
 def units(answer: Identification, name: str) -> str:
@@ -140,9 +157,8 @@ def structure_text(answer: Identification, shape: Shape) -> str:
 def chosen(answer: Identification) -> list[str]:
     """What was chosen, and what came second."""
     found, names, memory, output = answer.structure, answer.roles.inputs, answer.memory, answer.roles.output
-    moving, root = {move.what for move in answer.moves}, ": perhaps a unit root" if memory.root else ""
-    idle = ", ".join(name for j, name in enumerate(names) if j not in found.lags)
-    steady = ", ".join(names[j] for j in sorted(found.lags) if moving and names[j] not in moving)
+    root = ": perhaps a unit root" if memory.root else ""
+    idle = ", ".join(name for j, name in enumerate(names) if j not in found.lags and not answer.moves)
     other = found.forecast and structure_text(answer, found.forecast.shape)
     lags = f"; sum of the lags of {output} {memory.value:.3f} +- {memory.std:.2g}{root}" if found.na else ""
     logged = f"the same of the logarithm of {output}, {found.log[0]:.1f} +- {found.log[1]:.1f} nats ahead"
@@ -151,7 +167,7 @@ def chosen(answer: Identification) -> list[str]:
     told = (
         f"Chosen: {structure_text(answer, found.shape)} (lags in samples){lags}.", *said[:1],
         found.log[0] > TIED and f"Better: {logged}, on the scale of {output}.",
-        steady and f"Constant: {steady}.", idle and f"Not needed: {idle}.",
+        idle and f"Not needed: {idle}.",
         other and f"An input at once explains {output} and does not forecast it. A forecast: {other}.",
     )  # fmt: skip
     return [one for one in told if one]
@@ -171,12 +187,18 @@ def commands(answer: Identification) -> list[str]:
     model, roles = answer.model, answer.roles
     each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
-    given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
-    served = f"driftfit serve {shlex.quote(PurePath(answer.source[0]).stem)}.toml   # with the unit that --page shows"
+    given = {name: f"--{name} {shlex.quote(value)}" for name, value in each.items() if value}
+    files, options, toml = shlex.join(answer.source), roles.options, shlex.quote(f"{stem(answer.source)}.toml")
+    found = " ".join(text for name, text in given.items() if name != "model")
     return [
-        *(f"driftfit {verb} {shlex.join(answer.source)} {given}{roles.options}" for verb in ("track", "detect")),
-        served,
+        *(f"driftfit {verb} {files} {' '.join(given.values())}{options}" for verb in ("track", "detect")),
+        f"driftfit identify {files} {found}{options} --quiet --serve {toml} && driftfit serve {toml}",
     ]
+
+
+def stem(source: Sequence[str]) -> str:
+    """The name of the first file, without its folder and ending."""
+    return PurePath(source[0]).stem
 
 
 def interval(roles: Roles) -> str:
@@ -184,13 +206,15 @@ def interval(roles: Roles) -> str:
     return roles.dt if isinstance(roles.dt, str) else f"{roles.dt:g}"
 
 
-def unit(answer: Identification) -> str:
-    """The unit of a service, as TOML."""
-    own = dict[str, Any](name=PurePath(answer.source[0]).stem, y=answer.roles.output, u=answer.model.input_names)
-    own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
-    each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
-    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
-    return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
+def unit(answer: Identification | ManyIdentified) -> str:
+    """The unit of a service, as TOML; of records a pattern, which makes one of every topic."""
+    roles, match = answer.roles, stem(answer.source) if isinstance(answer, Identification) else "{unit}"
+    own = dict[str, Any](match=match, y=roles.output, u=answer.model.input_names)
+    timed = roles.clock is not None and isinstance(roles.dt, str) and Clock.of(roles.dt).duration is not None
+    own |= {"time": roles.clock, "dt": roles.dt} if timed else {}
+    own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
+    text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
+    return f"[[unit]]\n{text}alarm = {{ every = {json.dumps('1 week' if timed else 10_000)} }}\n"
 
 
 def effect(answer: Identification, one: Effect) -> str:
@@ -210,7 +234,7 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     said = [f"{head}: {'; '.join(each)}." for head, each in
             (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
-    short = [line if len(line) < WIDTH else line.replace(" --model", " \\\n   --model") for line in commands(answer)]
+    short = [line if len(line) < WIDTH else SPLIT.sub(r" \\\n   \1", line) for line in commands(answer)]
     return [
         (style, f" {line}") for style, line in (*found, *(("", one) for one in said), *(("dim", one) for one in short))
     ]
@@ -280,9 +304,13 @@ def body(answer: Identification) -> list[str]:
     leads = (f"{name} {one[0]:.1f} +- {one[1]:.1f}" for name, one in
              (("tracked parameters", cause.tracked), ("a curve", cause.curve), ("both", cause.joint)))  # fmt: skip
     if answer.kind in KINDS[1:3] and answer.model.input_names:
-        signals = f"RLS(1.0), y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
-        curve = f"<p>That curve, fitted:</p><pre>{escape(f'track({answer.curve.model!r}, {signals})')}</pre>"
-    copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
+        run, own = answer.curve, {"y": answer.roles.output, "u": [*answer.model.input_names]}
+        own |= {"data": answer.source[0] if len(answer.source) == 1 else [*answer.source], "time": answer.roles.clock}
+        given = "".join(f", {name}={one!r}" for name, one in (own | {"dt": answer.roles.dt}).items() if one)
+        error = root_mean_square((run.y - run.prediction)[settled(run)])
+        curve = f"<p>That curve, fitted; its error one step ahead is {error:.4g}:</p>"
+        curve += f"<pre>{escape(f'track({run.model!r}, RLS(1.0){given})')}</pre>"
+    copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer), SERVICE + unit(answer)))
     each = (f"{one.name}: {effect(answer, one)}; smallest change that would have been found {number(one.least)}"
             for one in answer.effects)  # fmt: skip
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
@@ -294,7 +322,11 @@ def body(answer: Identification) -> list[str]:
         section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer.roles)])),
         section("Problems of the data", _listed(answer.notes) or "<p>None.</p>"),
         section("What it could not decide", _listed(open_)),
-        section("To go on", f"{copied}<p>The last is a unit for <code>driftfit serve</code>.</p>"),
+        section(
+            "To go on",
+            f"{copied}<p>The last is the configuration that <code>--serve</code> writes. In Python, "
+            f"<code>answer.live()</code> continues the record with an alarm armed.</p>",
+        ),
     ]
 
 
@@ -378,6 +410,17 @@ class Identification(Printed):
         fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
         return fitted
 
+    def live(self, every: float = 10_000.0) -> Live:
+        """The stream that continues the record, with an alarm armed: what came after the last change is its reference.
+
+        ``every``: samples in which one false alarm may begin. ValueError where too few samples came after the change.
+        """
+        run = self.track
+        armed = run.detect(every=every, reference=(max((move.end for move in self.moves), default=0), len(run)))
+        stream = Live(run.model, run.tracker, self.roles.dt if self.roles.clock else None, warm_start=run)
+        stream.detect(armed.rule)
+        return stream
+
     headline = property(conclusion)
     json, plot, page = as_json, figure, html
 
@@ -396,6 +439,7 @@ class ManyIdentified(Printed):
     worst: Mapping[Any, Identification]
     roles: Roles = field(repr=False)
     notes: tuple[str, ...]
+    source: tuple[str, ...]
     page = page_of_many
 
     @property
@@ -417,9 +461,9 @@ class ManyIdentified(Printed):
         return data
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
-        data = f"Data: {'; '.join(self.notes)}." if self.notes else ""
-        yield Text("\n".join(f" {line}" for text in (*columns(self.roles), data) for line in wrap(text, WIDTH - 1)))
+        first = f"{len(self.verdict)} records with one structure: {self.model!r}"
+        said = (first, *columns(self.roles), f"Data: {'; '.join(self.notes)}." if self.notes else "")
+        yield Text("\n".join(f" {line}" for text in said for line in wrap(text, WIDTH - 1)))
         yield self.verdict
         for key, one in self.worst.items():
             yield Text("\n " + "\n ".join(wrap(f"{key}: {one.headline}", WIDTH - 1)))

@@ -42,8 +42,8 @@ class Roles:
     """The columns, and the record: y (T,), U (T, m), time (T,) or None, key of every row.
 
     ``dt``: nominal interval, as for `track`. ``why``: why a column is no input. ``refused``: readings taken as
-    missing, by column. ``missing``: readings that were missing already. ``options``: how
-    the file was read, as options of the command.
+    missing, by column. ``missing``: readings that were missing already. ``dropped``: rows
+    without a time or with one that another row has. ``options``: how the file was read, as options of the command.
     """
 
     output: str
@@ -58,6 +58,7 @@ class Roles:
     why: Mapping[str, str] = field(default_factory=dict)
     refused: Mapping[str, int] = field(default_factory=dict)
     missing: int = 0
+    dropped: int = 0
     units: Mapping[str, str] = field(default_factory=dict)
     options: str = ""
     zone: str | None = None
@@ -142,7 +143,9 @@ def roles(
     left = [name for name in numbers if name not in (clock, by, *why)]
     if y is None:
         left = [name for name in left if _moves(numbers[name])]
-        if len(left) != 1:
+        if not left:
+            raise NoAnswerError("no column holds numbers that move; one output is needed.")
+        if len(left) > 1:
             raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(left)}.")
         y = left[0]
     if worded := [name for name in (y, *(u or ())) if name not in numbers]:
@@ -172,8 +175,8 @@ def roles(
         raise NoAnswerError(f"{len(known)} of {len(frame)} rows hold {y}; at least {FEWEST} are needed.")
     if not _moves(known):
         raise NoAnswerError(f"{y} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
-    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units,
-                  _options(wanted or Wanted(()), limits or {}), zone)  # fmt: skip
+    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units=units,
+                  options=_options(wanted or Wanted(()), limits or {}), zone=zone)  # fmt: skip
     return _in_order(found)
 
 
@@ -196,7 +199,7 @@ def _in_order(found: Roles) -> Roles:
     time, groups = found.time[order], found.groups[order]
     new = np.append(True, (time[1:] != time[:-1]) | (groups[1:] != groups[:-1]))
     dt = median_interval(time[new], found.zone)[1] if found.dt is None and new.sum() > 1 else found.dt
-    return replace(found.rows(order[new]), dt=dt)
+    return replace(found.rows(order[new]), dt=dt, dropped=len(found.time) - int(new.sum()))
 
 
 def _frame(data: Any, wanted: Wanted) -> tuple[Any, dict[str, str]]:
@@ -276,7 +279,7 @@ def _reason(numbers: Mapping[str, Array], name: str, others: Iterable[str]) -> s
 def _key(frame: Any, texts: Sequence[str], by: str | None, axis: Array | None) -> tuple[tuple[Any, ...], str | None]:
     """(key of every row, name of the column): given, of text with few values, or where the clock runs back.
 
-    Text that changes to and fro in one time is a state of one plant, and no key.
+    Text that changes to and fro in one time is a state of one plant, and no key. Few rows that are late are no records.
     """
     cells = {name: frame[name].to_list() for name in texts}
     count = {name: len(set(column)) for name, column in cells.items()}
@@ -287,6 +290,7 @@ def _key(frame: Any, texts: Sequence[str], by: str | None, axis: Array | None) -
     if by is not None:
         return tuple(frame[by].to_list()), by
     back = np.append(False, axis[1:] < axis[:-1]) if axis is not None else np.zeros(len(frame), bool)
-    if 0 < back.sum() <= len(frame) // 100:
+    late = np.sum(axis < np.fmax.accumulate(axis)) if axis is not None else 0
+    if back.sum() <= len(frame) // 100 < late:
         return tuple(f"record {k + 1}" for k in np.cumsum(back)), BACK
     return (0,) * len(frame), None

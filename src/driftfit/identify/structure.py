@@ -46,8 +46,8 @@ class Structure:
 
     ``delays``: the least and the largest nk that are as good. ``second``: other structures, by how many nats they are
     behind, and the standard error of that. ``doubtful``: inputs that are no better than displaced copies. ``instead``:
-    pairs of an input and one that could replace it. ``log``: by how many nats the same of the logarithm of a positive
-    output leads, on the scale of the output. ``forecast``: the same with nk of at least 1, if it is another.
+    an input with the one or two others that could replace it. ``log``: by how many nats the same of the logarithm of a
+    positive output leads, on the scale of the output. ``forecast``: the same with nk of at least 1, if it is another.
     ``narrowed``: where the search was cut short.
     """
 
@@ -56,7 +56,7 @@ class Structure:
     delays: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     second: tuple[tuple[Shape, float, float], ...] = ()
     doubtful: tuple[int, ...] = ()
-    instead: tuple[tuple[int, int], ...] = ()
+    instead: tuple[tuple[int, tuple[int, ...]], ...] = ()
     log: tuple[float, float] = (0.0, 0.0)
     forecast: Structure | None = None
     narrowed: str = ""
@@ -194,7 +194,12 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float,
                     break
                 ends[side] += step
         delays[j] = ends[0], ends[1]
-        instead += [(j, i) for i, (score, _) in pool.best_delays((na, rest)).items() if i != j and base - score < TIED]
+        others = {(i,): one for i, one in pool.best_delays((na, rest)).items() if i != j}
+        if others and base - max(others.values())[0] >= TIED:  # two others, as of a sum
+            (i,), (_, k) = max(others.items(), key=lambda one: one[1])
+            more = pool.best_delays((na, (*rest, (i, 1, k))))
+            others = {(i, h): one for h, one in more.items() if h != j}
+        instead += [(j, of) for of, (score, _) in others.items() if base - score < TIED]
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
     second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
     lags = {j: (nb, nk) for j, nb, nk in inputs}

@@ -18,7 +18,7 @@ export const fromFile = (user) => {
     event.submitter.disabled = false;
     at("record-said").textContent = answer.error ?? answer.headline;
     if (answer.error) return;
-    at("record-unit").textContent = `# for the configuration, with match = "..." in place of its name\n${answer.unit}`;
+    at("record-unit").textContent = `# for the configuration; match is the topic of its samples\n${answer.unit}`;
     at("record-page").href = URL.createObjectURL(new Blob([answer.page], { type: "text/html" }));
     at("record-unit").hidden = at("record-page").hidden = false;
   });
