@@ -123,8 +123,8 @@ def control(
     )  # fmt: skip
     if why == len(HELD):
         raise ValueError("control: the inputs given as u= leave none within the limits and moves.")
-    v = work["v"]
-    return Plan(v[:, 0] if model.m == 1 else v, work["y_hat"], work["theta_std"], HELD[why])
+    chosen = work["u"]
+    return Plan(chosen[:, 0] if model.m == 1 else chosen, work["y_hat"], work["theta_std"], HELD[why])
 
 
 def _look_ahead(live: Live, lane: Any, c: float, points: Array) -> None:

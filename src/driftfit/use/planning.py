@@ -25,7 +25,7 @@ def room(model: ARX, tracker: Any, h: int) -> dict[str, tuple[int, ...]]:
     """The last arguments of `plan`, results and working arrays, with their shapes."""
     S, m = 2 * model.n if tracker.covariance else 1, model.m
     return {
-        "v": (h, m), "y_hat": (h,), "theta_std": (h,), "points": (S, h, model.n), "rest": (S, h),
+        "u": (h, m), "y_hat": (h,), "theta_std": (h,), "points": (S, h, model.n), "rest": (S, h),
         "effect": (S, h, h, m), "outputs": (S, h), "last": (m,), "least": (h, m), "most": (h, m), "slope": (h, m),
         "H": (h, m, h, m), "R": (h * m, h * m), "away": (h * m,), "group": (h, m),
     }  # fmt: skip
@@ -34,15 +34,6 @@ def room(model: ARX, tracker: Any, h: int) -> dict[str, tuple[int, ...]]:
 def terms_of(model: ARX) -> Array:
     """(n, 3): which signal every regressor is (`OUTPUT`, `INPUT` or none), its number, and its lag."""
     return np.array([("1yu".index(what), j, lag) for what, j, lag in model.terms])
-
-
-def at_sample(s: State, P: Array, c: float, k: int, points: Array) -> None:
-    """The same at one sample, from the state in C (`driftfit.trackers.base.Tracker.cov`)."""
-    for i in range(P.shape[0]):
-        for j in range(i):
-            P[i, j] = s.P[i, j, 0] * s.scale[0]
-        P[i, i] = s.var[i, 0]
-    points_around(s.theta[:, 0], P, c, k, points)
 
 
 @shared
@@ -76,8 +67,18 @@ def points_around(theta: Array, P: Array, c: float, k: int, points: Array) -> No
 
 @Driver
 def spread(theta: Array, P: Array, c: float, k: int, points: Array) -> None:
-    """`points_around`, from Python."""
+    """`points_around`, for Python."""
     points_around(theta, P, c, k, points)
+
+
+def spread_of_state(s: State, P: Array, c: float, k: int, points: Array) -> None:
+    """`points_around`, for C: from the state itself, whose covariance is that of `driftfit.trackers.base.Tracker.cov`."""
+    if points.shape[0] > 1:
+        for i in range(P.shape[0]):
+            for j in range(i):
+                P[i, j] = s.P[i, j, 0] * s.scale[0]
+            P[i, i] = s.var[i, 0]
+    points_around(s.theta[:, 0], P, c, k, points)
 
 
 @shared
