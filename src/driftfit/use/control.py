@@ -12,15 +12,10 @@ subject to low <= u_k <= high and |u_k - u_(k-1)| <= move, with L_k the Cholesky
 so that c = 0 is certainty equivalence, which takes the estimate for the truth, and c = 1 is cautious control. P_k
 contains the drift and the jumps that the tracker expects until then.
 
-J is convex and quadratic. From inputs that keep all limits, it is minimised in rounds of two parts, each of which keeps
-them too:
-
-    sweep    every run u_k .. u_e of an input moves, all by the same amount, to where J is least
-    Newton   inputs at a limit stay, inputs whose difference is at its limit move together, and the rest goes to the
-             minimum of J over these, or to the first limit on the way and then on without the input that is there
-
-A point from which no run leads down is the minimum: the directions that limits and moves leave open are sums of runs.
-The number of rounds is bounded, and whatever they reach can be applied.
+J is convex and quadratic. From inputs that keep all limits it is minimised by coordinate descent: every run u_k .. u_e
+of an input moves, all by the same amount, to where J is least within limits and moves, by turns until none moves any
+more. The minimum is the only point from which no run leads down, because the directions that limits of inputs and of
+their moves leave open are sums of runs. The number of sweeps is bounded, and what they have reached can be applied.
 
 Caution learns little, because it makes inputs small where parameters are uncertain. Dual control learns on purpose. The
 first input may differ from the cautious one by d, if that costs at most ``probe`` times the part of J that is due to
@@ -28,11 +23,10 @@ the uncertainty of theta; of the two ends of this interval, within the limits, i
 output that it acts on is the more uncertain, and so tells more.
 
 Source: Astrom and Wittenmark, Adaptive Control (1995), chapter 7 (caution); Filatov and Unbehauen, Survey of adaptive
-dual control methods, IEE Proc. Control Theory Appl. 147 (2000) (two criteria); More and Toraldo, SIAM J. Optim. 1
-(1991) (gradient projection finds the limits, Newton steps the minimum within them). Departures: runs take the place of
-projected gradients, because limits of moves are not a box; the interval of the second criterion is given by its cost,
-which has no unit to choose. Cost: O(h n^3 + n (h m)^2), and O((h m)^3) for each Newton step. ``plan`` and what it calls
-is translated to C (`driftfit.embedded.export_c`), which gives the same bits.
+dual control methods, IEE Proc. Control Theory Appl. 147 (2000) (two criteria). Departures: runs take the place of
+single coordinates, at which limits of moves would stop a descent; the interval of the second criterion is given by its
+cost, which has no unit to choose. Cost: O(h n^3 + n (h m)^2), and O(h^3 m^2) for each sweep. `planning` is translated
+to C (`driftfit.embedded.export_c`), which gives the same bits.
 """
 
 from __future__ import annotations

@@ -16,9 +16,10 @@ OUTPUT, INPUT = 1, 2
 LIGHT = 1e-8
 """Cost of changing an input, as a share of the curvature of J: one without effect stays as it is."""
 
-ROUNDS, NEAR = 20, 1e-6
-"""Rounds at most; of 120 random problems all had their minimum, to rounding, after 20, and 111 after 3. The share of an
-input or of its largest move that does not matter: nearer to a limit it is at the limit, and smaller steps are none."""
+SWEEPS, NEAR = 200, 1e-6
+"""Sweeps at most, and the share of an input or of its largest move that does not matter. Of 120 random problems 116
+came within 1e-6 of the least J, after 23 sweeps on average; the others lacked at most 0.1 % of what J had been before.
+"""
 
 
 def room(model: ARX, tracker: Any, h: int) -> dict[str, tuple[int, ...]]:
@@ -27,7 +28,7 @@ def room(model: ARX, tracker: Any, h: int) -> dict[str, tuple[int, ...]]:
     return {
         "u": (h, m), "y_hat": (h,), "theta_std": (h,), "points": (S, h, model.n), "rest": (S, h),
         "effect": (S, h, h, m), "outputs": (S, h), "last": (m,), "least": (h, m), "most": (h, m), "slope": (h, m),
-        "H": (h, m, h, m), "R": (h * m, h * m), "away": (h * m,), "group": (h, m),
+        "column": (h, m), "H": (h, m, h, m),
     }  # fmt: skip
 
 
@@ -37,32 +38,25 @@ def terms_of(model: ARX) -> Array:
 
 
 @shared
-def factorise(A: Array) -> None:
-    """A = L L' in place, in the lower triangle; a column of L is 0 where A is semidefinite."""
-    for j in range(A.shape[0]):
-        least = ROUNDING * A[j, j]
-        for i in range(j, A.shape[0]):
-            for k in range(j):
-                A[i, j] -= A[i, k] * A[j, k]
-        scale = 0.0 if A[j, j] <= least else 1.0 / np.sqrt(A[j, j])
-        for i in range(j, A.shape[0]):
-            A[i, j] *= scale
-
-
-@shared
 def points_around(theta: Array, P: Array, c: float, k: int, points: Array) -> None:
-    """theta +- c sqrt(n) L e_i at sample k; P becomes L. Theta alone where there is room for one point."""
+    """theta +- c sqrt(n) L e_i at sample k; the lower triangle of P becomes L, 0 in columns where P is semidefinite.
+
+    Theta alone where there is room for one point.
+    """
     n = theta.shape[0]
     for p in range(points.shape[0]):
         for i in range(n):
             points[p, k, i] = theta[i]
-    if points.shape[0] > 1:
-        factorise(P)
-        far = c * np.sqrt(n)
-        for p in range(n):
-            for i in range(p, n):
-                points[p, k, i] += far * P[i, p]
-                points[n + p, k, i] -= far * P[i, p]
+    for j in range(n if points.shape[0] > 1 else 0):
+        least = ROUNDING * P[j, j]
+        for i in range(j, n):
+            for q in range(j):
+                P[i, j] -= P[i, q] * P[j, q]
+        scale = 0.0 if P[j, j] <= least else 1.0 / np.sqrt(P[j, j])
+        for i in range(j, n):
+            P[i, j] *= scale
+            points[j, k, i] += c * np.sqrt(n) * P[i, j]
+            points[n + j, k, i] -= c * np.sqrt(n) * P[i, j]
 
 
 @Driver
@@ -72,7 +66,7 @@ def spread(theta: Array, P: Array, c: float, k: int, points: Array) -> None:
 
 
 def spread_of_state(s: State, P: Array, c: float, k: int, points: Array) -> None:
-    """`points_around`, for C: from the state itself, whose covariance is that of `driftfit.trackers.base.Tracker.cov`."""
+    """`points_around`, for C: from the state itself, with the covariance of `driftfit.trackers.base.Tracker.cov`."""
     if points.shape[0] > 1:
         for i in range(P.shape[0]):
             for j in range(i):
@@ -205,20 +199,26 @@ def curvature(
 
 
 @shared
-def sweep(H: Array, slope: Array, last: Array, move: Array, least: Array, most: Array, v: Array) -> float:
-    """Move every run of an input to where J is least; returns the largest movement."""
+def sweep(
+    H: Array, slope: Array, column: Array, last: Array, move: Array, least: Array, most: Array, v: Array
+) -> float:
+    """Move every run of an input to where J is least; returns the largest movement. ``column``: H times the run."""
     h, m, largest = v.shape[0], v.shape[1], 0.0
     for j in range(m):
         for k in range(h):
             curve, gradient, down, up = 0.0, 0.0, -np.inf, np.inf
+            for q in range(h):
+                for i in range(m):
+                    column[q, i] = 0.0
             for e in range(k, h):
                 if least[e, j] == most[e, j]:
                     break
                 before = last[j] if k == 0 else v[k - 1, j]
                 gradient += slope[e, j]
-                curve += H[e, j, e, j]
-                for f in range(k, e):
-                    curve += 2.0 * H[e, j, f, j]
+                curve += 2.0 * column[e, j] + H[e, j, e, j]
+                for q in range(h):
+                    for i in range(m):
+                        column[q, i] += H[q, i, e, j]
                 down, up = max(down, least[e, j] - v[e, j]), min(up, most[e, j] - v[e, j])
                 low, high = max(down, before - move[j] - v[k, j]), min(up, before + move[j] - v[k, j])
                 if e < h - 1:
@@ -227,95 +227,14 @@ def sweep(H: Array, slope: Array, last: Array, move: Array, least: Array, most: 
                 step = min(max(-gradient / curve, low), high)
                 for f in range(k, e + 1):
                     v[f, j] += step
-                    for q in range(h):
-                        for i in range(m):
-                            slope[q, i] += step * H[q, i, f, j]
+                for q in range(h):
+                    for i in range(m):
+                        slope[q, i] += step * column[q, i]
                 gradient += step * curve
                 down -= step
                 up -= step
                 largest = max(largest, abs(step))
     return largest
-
-
-@shared
-def group_inputs(last: Array, move: Array, least: Array, most: Array, v: Array, group: Array) -> None:
-    """The first input that each moves together with, because the moves between them are at their limit; -1: none."""
-    h, m = v.shape
-    for j in range(m):
-        for k in range(h):
-            near = NEAR * abs(v[k, j])
-            before = last[j] if k == 0 else v[k - 1, j]
-            tied = abs(v[k, j] - before) >= move[j] * (1.0 - NEAR)
-            stuck = v[k, j] <= least[k, j] + near or v[k, j] >= most[k, j] - near
-            own = -1.0 if k == 0 else group[k - 1, j]
-            group[k, j] = -1.0 if stuck else own if tied else 1.0 * (k * m + j)
-        for k in range(h - 2, -1, -1):
-            if abs(v[k + 1, j] - v[k, j]) >= move[j] * (1.0 - NEAR) and group[k + 1, j] < 0.0:
-                group[k, j] = -1.0
-
-
-@shared
-def share_of(step: float, low: float, high: float) -> float:
-    """How much of a step stays between low <= 0 and high >= 0."""
-    room = high if step > 0.0 else -low
-    return 1.0 if abs(step) <= room else max(room, 0.0) / abs(step)
-
-
-@shared
-def solve(A: Array, x: Array) -> None:
-    """x <- A^-1 x, with A factorised in place; entries in which A is 0 become 0."""
-    n = A.shape[0]
-    factorise(A)
-    for i in range(n):
-        for k in range(i):
-            x[i] -= A[i, k] * x[k]
-        x[i] = x[i] / A[i, i] if A[i, i] > 0.0 else 0.0
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= A[k, i] * x[k]
-        x[i] = x[i] / A[i, i] if A[i, i] > 0.0 else 0.0
-
-
-@shared
-def newton(
-    H: Array, slope: Array, last: Array, move: Array, least: Array, most: Array, v: Array, R: Array, away: Array,
-    group: Array
-) -> float:  # fmt: skip
-    """Go to the minimum of J over groups of inputs, or to the first limit; returns the share of the way."""
-    h, m = v.shape
-    group_inputs(last, move, least, most, v, group)
-    for a in range(h * m):
-        away[a] = 0.0
-        for b in range(h * m):
-            R[a, b] = 0.0
-    for e in range(h):
-        for j in range(m):
-            if group[e, j] >= 0.0:
-                a = int(group[e, j])
-                away[a] -= slope[e, j]
-                for f in range(h):
-                    for i in range(m):
-                        if group[f, i] >= 0.0:
-                            R[a, int(group[f, i])] += H[e, j, f, i]
-    solve(R, away)
-    share = 1.0
-    for j in range(m):
-        moved, before = 0.0, last[j]
-        for k in range(h):
-            step = away[int(group[k, j])] if group[k, j] >= 0.0 else 0.0
-            share = min(share, share_of(step, least[k, j] - v[k, j], most[k, j] - v[k, j]))
-            change = v[k, j] - before
-            share = min(share, share_of(step - moved, -move[j] - change, move[j] - change))
-            moved, before = step, v[k, j]
-    for e in range(h):
-        for j in range(m):
-            if group[e, j] >= 0.0:
-                step = share * away[int(group[e, j])]
-                v[e, j] += step
-                for f in range(h):
-                    for i in range(m):
-                        slope[f, i] += step * H[f, i, e, j]
-    return share
 
 
 @shared
@@ -343,8 +262,8 @@ def probing(
 def plan(
     terms: Array, y_lag: Array, u_lag: Array, late: int, target: Array, given: Array, lower: Array, upper: Array,
     move: Array, effort: float, probe: float, v: Array, y_hat: Array, theta_std: Array, points: Array, rest: Array,
-    effect: Array, outputs: Array, last: Array, least: Array, most: Array, slope: Array, H: Array, R: Array,
-    away: Array, group: Array
+    effect: Array, outputs: Array, last: Array, least: Array, most: Array, slope: Array,
+    column: Array, H: Array
 ) -> int:  # fmt: skip
     """Inputs v (h, m) from points of theta, lags, wanted outputs (h,) and limits (m,); see `room` and `HELD`."""
     h, m = v.shape
@@ -364,17 +283,14 @@ def plan(
     if not start_within(given, last, lower, upper, move, least, most, v):
         return 3
     curvature(rest, effect, outputs, target, last, effort, v, slope, H)
-    for _turn in range(ROUNDS):
+    for _turn in range(SWEEPS):
         largest = 0.0
-        moved = sweep(H, slope, last, move, least, most, v)
+        moved = sweep(H, slope, column, last, move, least, most, v)
         for k in range(h):
             for j in range(m):
                 largest = max(largest, abs(v[k, j]))
         if moved <= NEAR * largest:
             break
-        for _face in range(h * m):
-            if newton(H, slope, last, move, least, most, v, R, away, group) >= 1.0:
-                break
     for j in range(m):
         outcome(rest, effect, v, outputs)
         if probe > 0.0 and least[0, j] < most[0, j]:
