@@ -32,8 +32,8 @@ def stream(model: ARX = PLAIN, tracker: object = KALMAN, T: int = 12, seed: int 
 def points(live: Live, h: int) -> np.ndarray:
     """theta (S, h, n), written from the page: a random walk from the present mean and covariance."""
     n = len(live.theta)
-    P = [live.cov + (k + 1) * 1e-3 * np.eye(n) for k in range(h)]
-    roots = np.array([np.linalg.eigh(one)[1] * np.sqrt(n * np.linalg.eigh(one)[0]) for one in P])
+    P = np.array([live.cov + (k + 1) * 1e-3 * np.eye(n) for k in range(h)])
+    roots = np.sqrt(n) * np.linalg.cholesky(P)
     return np.concatenate([live.theta + sign * roots.transpose(2, 0, 1) for sign in (1, -1)])
 
 

@@ -18,6 +18,7 @@ from driftfit import (
     FLS,
     RLS,
     AdaptiveKalman,
+    AugmentedFLS,
     Bank,
     ContinuousTransfer,
     ExtendedKalman,
@@ -31,6 +32,7 @@ from driftfit import (
 )  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
+from driftfit.embedded.functions import translation
 from driftfit.embedded.project import record
 from driftfit.embedded.values import TranslationError
 from driftfit.engine.drivers import TrackerSteps
@@ -177,6 +179,55 @@ def test_a_gate_decides_as_it_does_in_a_stream(tmp_path, tracker, fixed_rate):
     counts = live.left_out.counts
     assert counts["Left out at the start"] == 2
     assert counts["Left out"] > 2
+
+
+PLANNED = {
+    "limits": (ARX(2, 2, nk=0), Kalman(q=1e-3, r=0.01), {"limits": (-0.8, 0.9), "move": 0.3, "effort": 0.01}),
+    "two inputs": (ARX(1, (1, 2), nk=(0, 2), intercept=True), RLS(0.98), {"limits": ([-1.0, -0.3], [1.0, 0.4])}),
+    "probing": (ARX(1, 1, nk=0), AdaptiveKalman(), {"probe": 0.2, "caution": 0.7, "move": 0.5}),
+    "no covariance": (ARX(1, 1), AugmentedFLS(100.0), {"caution": 0.0, "move": 1.0, "limits": (-2.0, 2.0)}),
+}
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", PLANNED)
+def test_a_controller_plans_the_inputs_of_a_stream_to_the_bit(tmp_path, name):
+    """In a loop, from before the parameters are determined, with a missing output and an input that is given."""
+    model, tracker, how = PLANNED[name]
+    h, rng = 5, np.random.default_rng(2)
+    export_c(model, tracker, tmp_path, gate=False, horizon=h)
+    live = Live(model, tracker, gate=False)
+    ours, m = Exported(tmp_path, live), live.model.m
+    shapes = translation(live.program, horizon=h).planning.fields
+    memory = np.zeros(1, [(field, float, shape) for field, shape in shapes.items()])
+    there, place = memory[0], ctypes.c_void_p(memory.ctypes.data)
+    ours.library.tracker_plan_init(place)
+    for field in how.keys() - {"limits"}:
+        there[field] = how[field]
+    there["low"], there["high"] = how.get("limits", (-np.inf, np.inf))
+    y, u, codes = np.zeros(1), np.zeros((1, m)), set()
+    for t in range(60):
+        reading = np.nan if t in (30, 31, 32) else float(y[0])
+        live.update(reading, u[0])
+        ours.update(reading, u[0])
+        target, given = np.sin(0.2 * (t + np.arange(h))), np.full((h, m), np.nan)
+        if t > 40 and name == "limits":
+            given[3] = live.lane()["u_lag"][0, 0]
+        plan = live.control(target, h, u=given, **how)
+        there["target"], there["given"] = target, given
+        why = ours.library.tracker_control(ours.buffer, ours.scratch, place)
+        codes.add(why)
+        assert (why > 0) == bool(plan.held)
+        np.testing.assert_array_equal(there["u"], plan.u.reshape(h, m))
+        np.testing.assert_array_equal(there["y_hat"], plan.y_hat)
+        np.testing.assert_array_equal(there["theta_std"], plan.theta_std)
+        u = plan.u.reshape(h, m)[:1] if not why else rng.normal(size=(1, m))
+        y = 0.7 * y + u @ np.arange(0.5, m) + 0.1 * rng.standard_normal()
+    assert same_numbers(ours.state, to_struct(live))  # a plan changes nothing
+    assert codes == {"limits": {0, 1, 2}, "no covariance": {0, 2}}.get(name, {0, 1, 2}), codes
+    there["given"], there["move"], there["target"] = np.nan, 0.01, 0.0
+    there["given"][1] = 50.0
+    assert ours.library.tracker_control(ours.buffer, ours.scratch, place) == 3
 
 
 def test_numbers_that_are_only_zero_or_one_are_integers_in_c(tmp_path):

@@ -13,12 +13,14 @@ from pathlib import Path
 from driftfit.data.arguments import check_ready
 from driftfit.embedded.functions import translation
 from driftfit.embedded.project import files_of, write
+from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.run.gating import gate_of
 from driftfit.run.program import Program
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
+from driftfit.use.control import check_plannable
 
 
 def export_c(
@@ -28,6 +30,7 @@ def export_c(
     *,
     fixed_rate: bool = False,
     gate: Gate | bool | None = None,
+    horizon: int | None = None,
 ) -> None:
     """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, a self-test, an S-function and ``README.md``.
 
@@ -44,12 +47,16 @@ def export_c(
         `AdaptiveKalman` do.)
     gate : bool, `Gate` or None
         As for `track`: whether readings are judged before they are used.
+    horizon : int or None
+        Write also ``tracker_control``, which plans the inputs of so many samples as `Live.control` does. The first
+        acts in the next row: with ``nk=0`` a row is an output, and the input that acted on it.
 
     Raises
     ------
     ValueError
         For a `Bank`, whose compiled routine works with vectors of eight numbers and on many leaves; for several
-        outputs; for incomplete settings; for a user's step that uses something without a translation.
+        outputs; for incomplete settings; for a user's step that uses something without a translation; with
+        ``horizon``, for a model that is no ARX with inputs.
     """
     if tracker.weighs:
         raise ValueError(
@@ -59,9 +66,12 @@ def export_c(
     if len(model.outputs) > 1:
         raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
     bound = model.bind(model.m)
+    if horizon is not None:
+        check_plannable("export_c", bound, tracker)
+        whole("export_c", "horizon", horizon, 1)
     program = Program(bound, check_ready(tracker), gate=gate_of(tracker, gate))
     what = f"{bound!r}, {tracker!r}" + ("" if program.gate is None else ", with a gate")
-    write(Path(path), files_of(program, what, fixed_rate))
+    write(Path(path), files_of(program, what, fixed_rate, horizon))
 
 
 def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:

@@ -41,11 +41,15 @@ from driftfit.embedded.values import (
     joined,
     lifted,
     narrow,
+    number,
     plain,
     renamed,
+    strides_of,
+    view,
 )
 from driftfit.engine.kernel import Array
 from driftfit.run.program import Program, State
+from driftfit.use.planning import plan, room, spread_of_state, terms_of
 
 
 class Statements(Expressions):
@@ -371,6 +375,17 @@ RESULTS = ("theta", "var")
 
 
 @dataclass(frozen=True)
+class Planning:
+    """Planning inputs: the fields of its structure with their shapes, calls that return points of theta at sample k and
+    a plan, and the operations of both."""
+
+    fields: dict[str, tuple[int, ...]]
+    points: str
+    plan: str
+    operations: tuple[Counter[str], Counter[str]]
+
+
+@dataclass(frozen=True)
 class Translation:
     """The functions in C, the one that takes a sample, the operations of an ordinary sample after the start, and the
     record's fields that the structure has."""
@@ -380,6 +395,7 @@ class Translation:
     ordinary: Counter[str]
     names: tuple[str, ...]
     scratch: tuple[str, ...]
+    planning: Planning | None = None
 
     @property
     def start(self) -> Array:
@@ -425,8 +441,8 @@ class Translation:
 
 
 @lru_cache(maxsize=16)
-def translation(program: Program, fixed_rate: bool = False) -> Translation:
-    """Translate the steps of a model and a tracker.
+def translation(program: Program, fixed_rate: bool = False, horizon: int | None = None) -> Translation:
+    """Translate the steps of a model and a tracker, and what plans inputs for ``horizon`` samples.
 
     A field that no step writes keeps the value that it starts with. Where all its entries are equal, that value becomes
     a constant of the text, and branches that it excludes are left out. A field to which steps assign only 0 and 1
@@ -448,11 +464,43 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
         if not (constant & unit.written or flags & unit.beyond):
             break
         constant, flags = constant - unit.written, flags - unit.beyond
+    planning = None if horizon is None else _planning(program, unit, horizon)
     text = "\n".join(function.text for function in unit.functions.values())
     read = {*re.findall(r"\bs->(\w+)", text), *factors, *RESULTS}
     names = [name for name in fields(tile) if identifier(name) in read]
     names.sort(key=lambda name: name in flags)  # no gaps: integers last
-    return Translation(unit, entry, usual.operations, tuple(names), tuple(sorted(scratch)))
+    return Translation(unit, entry, usual.operations, tuple(names), tuple(sorted(scratch)), planning)
+
+
+def _planning(program: Program, unit: Unit, h: int) -> Planning:
+    """Translate `driftfit.use.planning`; everything that is chosen on the controller is a field of the structure."""
+    model, m = program.model, program.model.m
+    given: dict[str, tuple[int, ...]] = {"target": (h,), "given": (h, m), "low": (m,), "high": (m,), "move": (m,)}
+    own = room(model, program.tracker, h)
+    shapes = {**given, "effort": (), "caution": (), "probe": (), **own, "P": (model.n, model.n)}
+    p = {name: _field_of_plan(name, shape) for name, shape in shapes.items()}
+    lags = [_lags(unit, name) for name in ("y_lag", "u_lag")]
+    known = [Value("table", constant=terms_of(model)), *lags, number(0)]
+    looking = [Value("record"), p["P"], p["caution"], Value("int", "k"), p["points"]]
+    planned = [*known, *(p[name] for name in (*given, "effort", "probe", *own))]
+    calls, operations = [], []
+    for source, arguments in ((spread_of_state, looking), (plan.function, planned)):
+        made = translate(unit, source, arguments)
+        calls.append(f"{made.name}({', '.join(text for one in arguments if (text := _passed(one)))})")
+        operations.append(made.operations)
+    return Planning(shapes, calls[0], calls[1], (operations[0], operations[1]))
+
+
+def _field_of_plan(name: str, shape: tuple[int, ...]) -> Value:
+    if not shape:
+        return Value("real", f"p->{name}")
+    return view(Value("array", f"p->{name}", shape=shape, strides=strides_of(shape)), [range(size) for size in shape])
+
+
+def _lags(unit: Unit, name: str) -> Value:
+    """The lags (rows, lags) of the state."""
+    field = unit.field(name)
+    return view(field, [*(range(size) for size in field.shape[:2]), number(0)])
 
 
 def _may_be_flag(start: Array) -> bool:

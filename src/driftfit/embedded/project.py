@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.embedded.functions import Translation, translation
+from driftfit.embedded.functions import FACTORS, Translation, translation
 from driftfit.embedded.values import as_code, assigned, comment, identifier, number
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
@@ -28,20 +28,21 @@ BOUND = 0.001
 """Largest error of single precision, as a share of the largest usual result or of the result itself."""
 
 
-def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
+def files_of(program: Program, what: str, fixed_rate: bool, horizon: int | None) -> dict[str, str]:
     """The text of every file, by its name."""
     from driftfit import __version__
 
-    made, m = translation(program, fixed_rate), program.model.m
+    made, m = translation(program, fixed_rate, horizon), program.model.m
     header = filled(
         "tracker.h", what=comment(what), version=__version__, n=made.start["theta"].shape[1], m=m,
         names=comment(", ".join(program.names)), fields=_fields(made, made.names),
-        known=FIXED_RATE if fixed_rate else KNOWN,
+        known=FIXED_RATE if fixed_rate else KNOWN, control=_control(made, program, "control.h"),
     )  # fmt: skip
     readme = filled(
         "README.md", what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
         singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
         gate="" if program.gate is None else GATED % made.start["gate_first"].shape[1],
+        control=_control(made, program, "control.md"),
     )  # fmt: skip
     return {
         "tracker.h": header, "tracker.c": filled("tracker.c", what=comment(what)) + _source(made, program),
@@ -88,7 +89,26 @@ def _source(made: Translation, program: Program) -> str:
         again="    if (s->gate_replay > 0) { first_samples_again(s); }\n" * bool(again),
         copies="\n".join(f"    {_copied(f's->{name}', f'START.{name}', size)}" for name, size in copies),
     )  # fmt: skip
-    return "\n\n".join([*support, *tables, start, scratch, steps, *again, face])
+    control = _control(made, program, "control.c")
+    return "\n\n".join([*support, *tables, start, scratch, steps, *again, face, *([control] if control else [])])
+
+
+def _control(made: Translation, program: Program, name: str) -> str:
+    """A text about planning inputs, if they are planned."""
+    if made.planning is None:
+        return ""
+    shapes, counts = made.planning.fields, made.planning.operations
+    (h,), m, words = shapes["target"], program.model.m, sum(int(np.prod(shape)) for shape in shapes.values())
+    first = list(shapes).index("points")
+    rest = [f"    tracker_real {field}[{np.prod(shape, dtype=int)}];" for field, shape in list(shapes.items())[first:]]
+    factors = [f"    scratch->{field} = 1;" for field in FACTORS if field in made.names]
+    return filled(
+        name, h=h, m=m, hm=h * m, doubles=8 * words, singles=4 * words, rest="\n".join(rest),
+        factors="\n".join(factors),
+        spread=made.planning.points.replace("s, scratch", "scratch, &work"), points=_counted(counts[0]),
+        plan=_counted(counts[1]), call=made.planning.plan.replace("s->", "scratch->"),
+        caution=int(program.tracker.covariance),
+    ).rstrip()  # fmt: skip
 
 
 def _again(made: Translation, program: Program) -> str:

@@ -110,7 +110,7 @@ def lifted(value: Any) -> Value:
     return Value("python", constant=value)
 
 
-def _strides(shape: tuple[int, ...]) -> tuple[int, ...]:
+def strides_of(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
 
 
@@ -241,7 +241,7 @@ class Unit:
         if name in self.constant and element == "real" and self.start_of(name) is None:
             self.replaced.add(name)
             text, _ = self.table(array)
-        return Value("array", text, shape=array.shape, strides=_strides(array.shape), element=element,
+        return Value("array", text, shape=array.shape, strides=strides_of(array.shape), element=element,
                      scalar=array.size == 1)  # fmt: skip
 
     def start_of(self, name: str) -> Any:

@@ -41,5 +41,5 @@ tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, con
 
 /* Forget what is known of theta and keep the past signals, as after maintenance. */
 void tracker_reset(tracker_state *s);
-
+@control@
 #endif
