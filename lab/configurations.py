@@ -28,6 +28,7 @@ from driftfit import (
     Change,
     Decide,
     ExtendedKalman,
+    FirstFloor,
     HammersteinWiener,
     Hybrid,
     Kalman,
@@ -67,6 +68,7 @@ BANKS: dict[str, Any] = {
     "IMM": Bank(CHANGES, SENSORS, p0=2.0, reduce=IMM()),
     "Decide": Bank(CHANGES, SENSORS, p0=2.0, reduce=Decide(2)),
     "Hybrid": Bank(CHANGES, SENSORS, p0=2.0, reduce=Hybrid(6)),
+    "FirstFloor": Bank(CHANGES, [Sensor.nominal(r=0.01)], p0=2.0, reduce=FirstFloor(2)),
     "beam, wide prior": Bank(CHANGES, SENSORS, p0=1e14, reduce=Beam(6)),
 }
 FORGETTING = [
@@ -90,6 +92,7 @@ EVERY_PART: dict[str, Any] = {
     "unknown noise, many leaves": Bank(CHANGES, [Sensor.nominal()], reduce=Beam(80)),
     "waiting": Bank(CHANGES, SENSORS, reduce=WAITING, p0=2.0),
     "waiting, unknown noise": Bank(CHANGES, [Sensor.nominal()], reduce=WAITING),
+    "FirstFloor, prior": Bank(CHANGES, [Sensor.nominal(r=0.01)], reduce=FirstFloor(3, "prior"), p0=2.0),
     "lags for certain": Bank(CHANGES, FAULTS, MARKOV, reduce=Beam(6), p0=2.0, lag_variance=False),
 }
 """Banks that together use every part of the compiled routine, from a prior that the first samples outgrow too."""

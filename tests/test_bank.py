@@ -9,7 +9,7 @@ from support import same
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam, Decide, Hybrid, Resample
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Resample
 from driftfit.bank.sensor import Sensor
 
 N, R = 2, 0.09
@@ -233,6 +233,23 @@ def test_one_hypothesis_is_the_kalman_filter_bit_for_bit(reduce, form):
             assert same(one, other), name
         else:  # without a prior a Kalman filter stays in square-root form for longer, to judge its first samples
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13, err_msg=name)
+
+
+def test_first_floor_with_prior_weights_is_one_kalman_filter():
+    mean = np.einsum("i,ijk->jk", PROBS, Q)
+    kalman = track(Regression(N), Kalman(q=mean, r=R, p0=2.0), Y, U)
+    bank = Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3, "prior"), p0=2.0)
+    run = track(Regression(N), bank, Y, U)
+    D = 3
+    root = state(run, "root")[:, 0]
+    np.testing.assert_allclose(root[8 : 8 + N], kalman.theta[len(Y) - 1 - D], atol=1e-12)
+
+
+def test_first_floor_remembers_what_its_tree_says():
+    run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3), p0=2.0), Y, U)
+    p = reported(run, "lag_prob")
+    np.testing.assert_allclose(p[3:].sum(axis=2), 1.0, atol=1e-12)
+    assert p[47, 1, 1:].sum() > 0.5  # the second jump, one sample later
 
 
 def test_leaves_clean_their_own_lags():

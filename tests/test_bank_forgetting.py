@@ -7,7 +7,7 @@ from test_bank import N, R, record
 
 from driftfit import RLS, Bank, Kalman, Regression, track
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam
+from driftfit.bank.reduction import GPB, IMM, Beam, FirstFloor
 from driftfit.bank.sensor import Sensor
 
 Y, U = record(80, 4, (40,))
@@ -156,6 +156,7 @@ def test_prediction_does_not_depend_on_the_sample_being_there():
         (lambda: Change(1.0, forget=0.9, reset=True), "not both"),
         (lambda: Change(forget=0.9, kind="linear"), "exponential"),
         (lambda: bank(Change(1.0, reset=True)), "normal course"),
+        (lambda: bank(Change(forget=0.9), reduce=FirstFloor(2)), "random walks only"),
     ],
 )
 def test_what_does_not_go_together(build, message):

@@ -8,7 +8,7 @@ import pytest
 
 from driftfit import RLS, Bank, Live, Regression, track
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam, Decide, Hybrid
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.tiles import as_compiled, tile_type
 from driftfit.run.program import Program
@@ -37,6 +37,7 @@ P = [[0.99, 0.01], [0.2, 0.8]]
         (lambda: Bank(TWO, reduce=GPB(13)), ["8192", "IMM()"]),
         (lambda: Bank(TWO, reduce=Beam(3000)), ["6000"]),
         (lambda: Bank(TWO, [*KNOWN, Sensor.outlier()], reduce=Decide(1)), ["Decide(1)", "never adapts", "force"]),
+        (lambda: Bank(TWO, [*KNOWN, Sensor.outlier()], reduce=FirstFloor(2)), ["one sensor"]),
         (lambda: Bank(TWO, reduce=Decide(2, loss=np.ones((3, 3)))), ["(2, 2)", "(3, 3)"]),
         (lambda: Bank(TWO, reduce="beam"), ["reduction", "'beam'"]),
         (lambda: Decide(0), ["depth", "at least 1"]),
@@ -87,7 +88,7 @@ def test_priors_per_sample_are_checked():
         Bank(), Bank(TWO, KNOWN, P, GPB(2)), Bank(TWO, [Sensor.nominal(guess=0.2), Sensor.outlier(5.0, "additive")]),
         Bank([Change(0.0), Change(1.0, prob=0.1, which=[1], name="gain")], KNOWN, reduce=Decide("auto")),
         Bank(TWO, [*KNOWN, Sensor.frozen(0.1)], (None, P), Hybrid(5)), Bank(TWO, reduce=IMM(), initial=[0.5, 0.5]),
-        Bank(TWO, reduce=Decide(2, loss=[[0.0, 5.0], [1.0, 0.0]])),
+        Bank(TWO, reduce=Decide(2, loss=[[0.0, 5.0], [1.0, 0.0]])), Bank(TWO, reduce=FirstFloor(2, "prior")),
     ],
 )  # fmt: skip
 def test_settings_survive_being_written_down(bank):

@@ -10,7 +10,7 @@ import numpy as np
 
 from driftfit.bank.bank import Bank
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam, Decide, Hybrid, Reduction
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
 from driftfit.bank.results.results import Hypotheses
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.kernel import Array
@@ -18,7 +18,6 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
 from lab.jumps import Jumping
-from lab.reproduce.hypotheses.first_floor import first_floor
 from lab.reproduce.hypotheses.references import Row, references
 from lab.reproduce.hypotheses.rivals import tuned
 
@@ -69,14 +68,12 @@ def window(threshold: float) -> Alarm:
 class Entry(NamedTuple):
     """A row of a table: a tracker, when it reports a change, and its view of the record."""
 
-    tracker: Tracker | None
-    """None: ``path`` is the run."""
+    tracker: Tracker
     alarm: Alarm | None = None
     literal: bool = False
     """Regressors of outputs as measured: no leaf cleans them."""
     prior: Callable[[Jumping], Array] | None = None
     """Probabilities of events that it is given."""
-    path: Callable[[Jumping], Any] | None = None
 
 
 class Contest(NamedTuple):
@@ -191,7 +188,7 @@ def clean() -> dict[str, Entry]:
         "RLS-EF 0.75": Entry(RLS(0.75, p0=P0 / R)), "RLS-DF 0.4": Entry(RLS(0.4, p0=P0 / R, kind="directional")),
         "KF diag(.004,.004,.04)": kalman(), "KF Qbar=sum p_i Q_i (untuned)": kalman(mean),
         **{f"Decide d={d}": decide(d) for d in range(1, 7)},
-        "FirstFloor posterior d=2": Entry(None, likeliest(1), path=lambda record: first_floor(record, CHANGES, R, P0)),
+        "FirstFloor posterior d=2": Entry(bank(FirstFloor(2)), likeliest(1)),
         **{f"GPB({n})": gpb(n) for n in range(1, 5)}, "IMM": imm(),
         **{f"Beam M={M}": beam(M) for M in (3, 5, 9)}, "oracle (events known)": oracle(),
         "Bank(), nothing given": Entry(Bank(), likeliest(3)),

@@ -41,9 +41,6 @@ class Score(NamedTuple):
 
 def run(entry: Entry, record: Jumping) -> Track:
     """Track a record."""
-    if entry.tracker is None:
-        assert entry.path is not None
-        return entry.path(record)  # type: ignore[no-any-return]
     prob = None if entry.prior is None else entry.prior(record)
     if not entry.literal:
         return track(MODEL, entry.tracker, record.y, record.u, prob=prob, keep="cov")
@@ -86,19 +83,15 @@ def score(entry: Entry, record: Jumping) -> Score:
     called = alarms(entry, made)
     firsts = [called[(called >= jump) & (called < jump + REACH)] for jump in record.jumps]
     hits = [found[0] - jump for found, jump in zip(firsts, record.jumps, strict=True) if len(found)]
-    is_bank = entry.tracker is None or isinstance(entry.tracker, Bank)
-    log_p = made.hypotheses.evidence if is_bank else log_density(made.innovation, made.innovation_std)
+    is_bank = isinstance(entry.tracker, Bank)
+    e, s = made.innovation, made.innovation_std
+    log_p = made.hypotheses.evidence if is_bank else -0.5 * (np.log(2.0 * np.pi * s**2) + (e / s) ** 2)
     return Score(
         np.array([square[part].sum() for part in masks]), np.array([part.sum() for part in masks]), len(hits),
         len(record.jumps), float(np.sum(hits)), int(np.sum(since_jump(record)[called] >= REACH)),
         float(log_p[masks[0]].mean()), nees(error[START:], made.written("P")[START:]),
         float(made.hypotheses.leaves.mean()) if is_bank else 1.0,
     )  # fmt: skip
-
-
-def log_density(e: Array, s: Array) -> Array:
-    """log N(e; 0, s^2)."""
-    return np.asarray(-0.5 * (np.log(2.0 * np.pi * s**2) + (e / s) ** 2))
 
 
 def nees(e: Array, P: Array) -> float:

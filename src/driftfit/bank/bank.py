@@ -59,7 +59,7 @@ from driftfit.engine.settings import as_numbers, check_numbers, factor, matrix, 
 from driftfit.models.base import Model
 from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.forms.diffuse import knowing, knowing_nothing, take_root
+from driftfit.trackers.forms.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing, take_root
 from driftfit.trackers.forms.excitation import not_learned, window
 from driftfit.trackers.forms.information import triangular_root
 
@@ -135,6 +135,8 @@ class Bank(Tracker):
         self._shape, self.event_probabilities  # noqa: B018  (both refuse what does not fit)
         if self.all_changes[0].reset:
             raise ValueError("Bank: the first change is the normal course of events and cannot be a reset.")
+        if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
+            raise ValueError("Bank: FirstFloor supports random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
         kinds, reduce = {other.kind for other in others}, self.reduction
         if isinstance(reduce, Decide) and reduce.deepest == 1 and kinds & {"outlier", "additive"} and not reduce.force:
@@ -198,7 +200,7 @@ class Bank(Tracker):
     def _apart(self) -> bool:
         """Whether changes are independent of earlier ones, so that a gap is one level of the tree."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
-        if Hd == 1:
+        if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
             return False
         P = self.event_probabilities[0].reshape(-1, Hd, Hm)
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
@@ -207,7 +209,7 @@ class Bank(Tracker):
     @property
     def chained(self) -> bool:
         """Whether a gap is a chain of changes, all of them walks, of which leaves distinguish two courses."""
-        merging = isinstance(self.reduction, reductions.IMM)
+        merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
         walks = not any(one.forgets for one in self.all_changes)
         return len(self.all_changes) > 1 and not self._apart and not merging and walks
 
@@ -272,11 +274,14 @@ class Bank(Tracker):
         sample = dict.fromkeys(SAMPLE._fields, 0.0) | {"reading": np.nan, "r": 1.0}
         sample["fade"] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         leaf = SimpleNamespace(**arrays, n=n, theta=theta0, cov=P0, **sample, **dict.fromkeys(COUNTER._fields, 0))
+        again = isinstance(self.reduction, reductions.FirstFloor)  # which keeps samples in theta
         if self.p0 is not None and (nominal.r is not None or guessed):
             limit_forgetting.py_func(leaf)
             begin.py_func(leaf, count, squares)
-            scale = 1.0
-        start: dict[str, Any] = dict(knowing_nothing(n) if self.p0 is None else knowing(n))
+            arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
+        start: dict[str, Any] = (
+            dict(knowing_nothing(n, ALMOST_ANY if again else WORST)) if self.p0 is None else dict(knowing(n))
+        )
         if self.p0 is not None and not leaf.settled:
             start |= {"S": np.zeros((n, n)), "R": np.zeros((n, n)), "root": 1}
             take_root.py_func(P0, start["R"], start["S"])
@@ -295,7 +300,7 @@ class Bank(Tracker):
             "sample": np.array([getattr(leaf, name) for name in SAMPLE._fields]),
             "counters": np.array([getattr(leaf, name) for name in COUNTER._fields]), **unresolved(),
             **start,
-            "within": 0.0, "x": np.zeros(n),
+            "can_frame": int(not again), "within": 0.0, "x": np.zeros(n),
             "column": -1,
             "W": np.zeros((n, n)), "Pz": np.zeros((n, n)),
             "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],

@@ -29,7 +29,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     loss, reduction, bases  losses of decisions; settings of the reduction; limits of the codes of leaves
     stamps, decided         times of the undecided events; the decisions made at this sample
     components              components of the predictive density (`reducing.lookahead`)
-    samples                 recent regressors (`reducing.lookahead`)
+    root, samples           the start and the samples from which the tree is grown again (`reducing.refilter`)
     ring                    recent samples, for the events of a stream
     new_events              the entries that an event adds to a history
     gap, path               changes that may have happened since the last used sample (`machine.gap`)
@@ -97,7 +97,7 @@ MOST_REPORTED = 8
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
     "maps_nominal", "places", "fixed_places", "lag_rows", "spare_square",
-    "sensors", "transition", "loss", "components", "samples", "Q", "ring",
+    "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
     "new_events", "gap", "path", "chain", "counts", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")

@@ -55,7 +55,7 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     more += ANSWERS if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
-    waits = shape.knobs[selection.WAIT] > 0.0
+    refilters, waits = shape.knobs[selection.KIND] == selection.REFILTER, shape.knobs[selection.WAIT] > 0.0
     return _of_changes(bank, n, unit, theta0) | {
         "parents": np.zeros((rows, parents)), "leaves": np.zeros((rows, children + WIDTH)),
         "history": np.zeros((K + 1, remembered)), "history_2": np.zeros((K + 1, remembered)),
@@ -65,8 +65,8 @@ def arrays_of(bank: Any, n: int, na: int, unit: float, theta0: Array) -> dict[st
         "sensors": table_of(bank.all_sensors), "given": np.full(H, np.nan),
         "row": np.zeros(H), "loss": bank.reduction.losses(H), "reduction": shape.knobs,
         "bases": shape.bases, "stamps": np.zeros(shape.held),
-        "components": np.zeros((4, K * H if waits else 1)),
-        "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if waits else 1, n)),
+        "components": np.zeros((4, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
+        "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": np.zeros((3 * H + Hd + 1 if bank.chained else 0, max(H, _whole_vectors(tri)) + 1)),
         "spare_square": np.zeros((square, children)), "lag_rows": np.eye(na, n + 1),
         "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),

@@ -59,7 +59,7 @@ class Reduction(Settings, ABC):
 
 def knobs(kind: int, **values: float) -> Array:
     """The vector of settings."""
-    vector = np.zeros(8)
+    vector = np.zeros(9)
     vector[selection.KIND], vector[selection.TAU], vector[selection.WAIT] = kind, -1.0, -1.0
     for name, value in values.items():
         vector[getattr(selection, name.upper())] = value
@@ -238,3 +238,26 @@ class Hybrid(Reduction):
             )
         vector = knobs(selection.HYBRID, leaves=self.leaves, cap=self.age_cap)
         return Shape(self.leaves, children, self.remembered, 1, vector, bases)
+
+
+@dataclass(frozen=True)
+class FirstFloor(Reduction):
+    """Merge the mixture over the oldest event into one density and grow the tree again; for comparison only.
+
+    weights="prior" is one Kalman filter with sum p_i Q_i; "posterior" uses the samples of the tree twice.
+    """
+
+    depth: int = 2
+    weights: str = "posterior"
+    lowest: ClassVar[dict[str, int]] = {"depth": 1}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of("FirstFloor", "weights", self.weights, ("posterior", "prior"))
+
+    def shape(self, Hd: int, Hm: int) -> Shape:
+        if Hm > 1:
+            raise ValueError("FirstFloor: it supports one sensor only; use GPB.")
+        children = tree("FirstFloor", Hd, self.depth, "use a smaller depth")
+        vector = knobs(selection.REFILTER, depth=self.depth, prior=float(self.weights == "prior"))
+        return Shape(children // Hd, children, self.depth, 1, vector, np.array([children * 1.0, 1, 1]))

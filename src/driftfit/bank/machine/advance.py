@@ -39,13 +39,16 @@ from driftfit.bank.machine.gap import SINCE, chances, close, covariances, extend
 from driftfit.bank.machine.grow import grow
 from driftfit.bank.machine.markov_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.bank.reducing.merge import combine, mix, sort, take
+from driftfit.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.bank.reducing.selection import (
     BEAM,
     CUT,
+    DEPTH,
     HYBRID,
     INTERACT,
     KIND,
     MERGE,
+    REFILTER,
     RESAMPLE,
     WAIT,
     beam,
@@ -204,7 +207,7 @@ def choose(t: Any, L: int) -> None:
     if kind == CUT:
         phi = t.phi
         if t.reduction[WAIT] > 0.0:  # the last regressor before the open events represents the next one
-            phi = samples[max(t.stored - 1 - t.held, 0) % len(samples)]
+            phi = samples[max(t.stored - 1 - t.held, 0) % len(samples), TIME + 1 :]
         decide(t, L, phi)
         t.groups = number(t.group, L, t.order)
     elif kind == MERGE:
@@ -222,11 +225,21 @@ def reduce(t: Any) -> int:
     """Carry out the reduction that `choose` planned; returns the number of parents of the next level."""
     L, kind, order = t.many_leaves, int(t.reduction[KIND]), t.order
     t.kept = 1.0
+    full = kind == REFILTER and t.stored >= int(t.reduction[DEPTH])
     alone = kind in (CUT, BEAM, RESAMPLE)  # every group is one leaf, in order
-    if kind in (MERGE, HYBRID):
+    if kind == REFILTER and not full:
+        for l in range(L):
+            order[l] = l
+        t.groups, alone = L, True
+    elif kind in (MERGE, HYBRID):
         alone = sort(t.group, L, t.groups, t.start, order) == t.groups
     if not alone and t.expanded == 0:
         descend(t, L, False)
+    if full:
+        t.stored -= 1
+        L = refilter(t, L)
+        histories(t, L)
+        return int(L)
     if kind == INTERACT:
         return int(mix(t, L))
     G = t.groups
@@ -240,10 +253,12 @@ def reduce(t: Any) -> int:
 
 
 @shared
-def keep_regressor(t: Any) -> None:
-    """Store the regressor, for looking ahead."""
+def keep_sample(t: Any) -> None:
+    """Store the sample, for growing the tree again or for looking ahead."""
+    kept = t.samples[t.stored % len(t.samples)]
+    kept[Y], kept[NOISE], kept[TIME] = t.y, t.noise, t.time
     for i in range(t.n):
-        t.samples[t.stored % len(t.samples), i] = t.phi[i]
+        kept[TIME + 1 + i] = t.phi[i]
     t.stored += 1
 
 
@@ -251,10 +266,12 @@ def keep_regressor(t: Any) -> None:
 def take_in(t: Any) -> None:
     """Process a sample that is used: reduce, grow, weigh, and plan the next reduction."""
     prior, kind = t.prior, int(t.reduction[KIND])
-    waits, own = t.reduction[WAIT] > 0.0, kind == INTERACT
+    waits, own, again = t.reduction[WAIT] > 0.0, kind == INTERACT, kind == REFILTER
     K = reduce(t)
-    if waits:
-        keep_regressor(t)
+    if again:
+        increments_now(t)
+    if again or waits:
+        keep_sample(t)
     t.expanded = 0
     if own:
         for e in range(len(prior)):
@@ -263,7 +280,7 @@ def take_in(t: Any) -> None:
     elif t.parted > 0:
         origins(t, t.many_leaves, K)
         K = split(t, K)
-    elif t.alike == 0:
+    elif t.alike == 0 or again:
         outlook(t, K, True, True)
     if t.open > 0 and t.apart > 0:
         close(t, K)
@@ -426,6 +443,8 @@ def bank(address: int) -> None:
     else:
         limit_forgetting(t)
         wait(t)
+        for row in range(len(t.root)):
+            t.root[row, 0] = t.leaves[row, 0]
         head[0], head[1], head[2], head[3] = lone_density(t), 0.0, 1.0, 1.0
     t.elapsed += t.dt
     if t.observed > 0.0:

@@ -21,8 +21,9 @@ lost. An interval of dt nominal samples is a gap of dt - 1 and a level.
 two leaves have one number: a leaf whose twin from an earlier gap is still there continues as one, with the moments of
 both courses. Without that rule leaves in one branch were split at every gap, and outgrew their table.
 
-Only random walks, and not under `IMM`, which mixes its leaves at every sample and widens by the mean. Cost:
-O(H^3 + H n^2) for each sample that is not used, and twice the leaves for the one that ends the gap.
+Only random walks, and not under `IMM`, which mixes its leaves at every sample, nor under `FirstFloor`, which grows the
+tree again from samples alone; both widen by the mean. Cost: O(H^3 + H n^2) for each sample that is not used, and twice
+the leaves for the one that ends the gap.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def alone(s: State, l: int) -> None:
     if ready:
         choose_form(s, l)
     if ready and s.root[l] > 0:
-        ready = s.within[l] >= RESIDUALS and spans_lags(s, l)
+        ready = s.can_frame[l] > 0 and s.within[l] >= RESIDUALS and spans_lags(s, l)
         if ready:
             begin_framed(s, l)
     s.counters[COUNTER.settled, l] = READY if ready else WAITING
@@ -203,7 +203,7 @@ def forecast_tree(s: State, l: int) -> None:
     if s.counters[COUNTER.framed, l] > 0:
         column, y_hat = whiten_within(s, s.phi[:, l], l), prediction(s, l)
         outside = column >= 0
-    if not outside and s.ok[l] > 0.0:
+    if not outside and s.ok[l] > 0.0 and s.can_frame[l] > 0:
         column = outgrown(s, l)
         if column >= 0 and s.counters[COUNTER.framed, l] == 0:
             frame_theta(s, l)

@@ -15,9 +15,9 @@ from driftfit.bank.reducing.lookahead import expected_risk
 from driftfit.engine.kernel import Array, kernel, log, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, sum_of
 
-CUT, MERGE, INTERACT, BEAM, HYBRID, RESAMPLE = range(6)
+CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER, RESAMPLE = range(7)
 """Kinds of reduction."""
-KIND, LEAVES, DEPTH, TAU, WAIT, CAP, AHEAD, SEED = range(8)
+KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD, SEED = range(9)
 """Entries of the vector of settings of a reduction."""
 STEP, MIX, MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 """Constants of the random numbers splitmix64 (Steele, Lea and Flood 2014)."""

@@ -45,6 +45,9 @@ hundred operations, with a margin."""
 WORST = 1e6
 """Largest variance inflation for which a covariance is used: ten of sixteen digits remain."""
 
+ALMOST_ANY = 1e13
+"""The same for trackers that cannot wait longer: they are least squares without drift before the change of form."""
+
 SIZE, STD, LOOSE, ROW, WORK = range(5)
 """Rows of ``work``: norms of the columns of S and of the rows of R, the scale of the error of R, a row to absorb."""
 
@@ -67,12 +70,12 @@ SCRATCH = ("H", "pivot", "work", "at_start")
 
 
 @lru_cache
-def knowing_nothing(n: int) -> Mapping[str, Any]:
+def knowing_nothing(n: int, worst: float = WORST) -> Mapping[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))
     fields = {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
-        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1,
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
     }  # fmt: skip
     for value in fields.values():
         if isinstance(value, np.ndarray):
@@ -437,7 +440,7 @@ def absorb_on_roots(s: State, l: int) -> None:
 @kernel
 def hand_over(s: State, l: int) -> None:
     """Make the covariance the state from now on, if it is accurate enough."""
-    s.root[l] = 0 if s.at_start[INFLATION, l] <= WORST else 1
+    s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
 
 
 @kernel
