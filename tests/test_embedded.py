@@ -65,6 +65,8 @@ OTHERS = {
     "laws": (ARX(1, 1), Kalman(q=1e-4, r=0.1, laws={"b1": (Law.trend(1e-6), Law.season(8))})),
     "continuous time": (ContinuousTransfer(2, 1, dt=0.1, offset=True), RLS(0.99)),
     "one parameter": (Regression(1), Kalman(q=1e-4, r=0.1)),
+    "volatility": (ARX(1, 1), Kalman(q=1e-4, r=0.1, volatility=0.01)),
+    "default, volatility": (ARX(1, 1), AdaptiveKalman(volatility=0.01)),
     "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }
 

@@ -118,13 +118,11 @@ def test_forecasts_are_printed_as_tables_and_parameters_of_one_name_apart():
     u = rng.normal(size=80)
     run = track(Regression(("intercept",), intercept=True), Kalman(q=1e-3, r=0.01), 1e6 + 2.0 * u, u)
     assert run.names == ("intercept", "intercept (2)")
-    with pytest.raises(ValueError, match=r"u has shape \(3,\), but 12 samples are asked for"):
-        run.forecast(12, np.ones(3))
-    text = repr(run.forecast(12, np.ones((12, 1))))
-    assert "Forecast of 12 samples" in text
-    assert "the first 10 of 12" in text
+    with pytest.raises(ValueError, match=r"u has shape \(3,\), but 42 samples are asked for"):
+        run.forecast(42, np.ones(3))
+    text = repr(run.forecast(42, np.ones((42, 1))))
+    assert "Forecast of 42 samples, 20 of 42 rows" in text
     assert "10000" in text
-    assert "array" not in text
 
 
 def test_a_forecast_without_inputs_says_what_it_needs():

@@ -91,11 +91,10 @@ def test_gains_and_responses_print_tables(run):
         (step, step.value[0, -1], step.std[0, -1], 8),
     ):
         lines = str(found).rstrip().splitlines()
-        assert lines[-1].split()[1:] == [f"{value:.4g}", f"{std:.2g}"]
+        assert lines[-1].split()[1:] == [f"{value:.4g}", f"{std:.3g}"]
         assert len(lines) == 4 + count
         assert repr(found) == str(found).strip("\n")
-    value, _ = gain
-    assert value is gain.value
+    assert gain[0] is gain.value
 
 
 def test_several_inputs_by_name():

@@ -141,15 +141,11 @@ def summarise(run: Track) -> Summary:
     )  # fmt: skip
     tracker = shortened(repr(run.tracker))
     return Summary(
-        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, *_criteria(run), burn, rows, compare(run),
+        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, information(run, 0, 2.0),
+        information(run, 0), burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
         (*remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
     )  # fmt: skip
-
-
-def _criteria(run: Track) -> tuple[float, float]:
-    """AIC and BIC with the settings taken as given; NaN without a sample that is used."""
-    return (information(run, 0, 2.0), information(run, 0)) if run.ok.any() else (float("nan"), float("nan"))
 
 
 def summarise_outputs(run: Outputs) -> ByOutput[Summary]:

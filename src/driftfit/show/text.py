@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from copy import copy
 from io import StringIO
 from itertools import pairwise
@@ -194,6 +194,18 @@ def table_of(title: str, *heads: str, names: int = 1, group: int = 1) -> Table:
     return table
 
 
+def path_table(title: str, names: Sequence[str], value: Array, std: Array, axis: Sequence[Any] | None = None) -> Table:
+    """At most 20 rows of values (N, k) with their standard deviations, which ``axis`` names, or numbers from 0."""
+    rows = some_rows(len(value))
+    heads = (head for name in names for head in (name, "+-"))
+    shown = f", {len(rows)} of {len(value)} rows" if len(value) > len(rows) else ""
+    table = table_of(f"{title}{shown}", "", *heads, group=2)
+    for i in rows:
+        cells = ((digits(x, s), "" if np.isnan(s) else f"{s:.3g}") for x, s in zip(value[i], std[i], strict=True))
+        table.add_row(Text(str(i if axis is None else axis[i])), *(cell for pair in cells for cell in pair))
+    return table
+
+
 Result = TypeVar("Result")
 
 
@@ -211,9 +223,6 @@ class ByOutput(Printed, Mapping[str, Result]):
 
     def __len__(self) -> int:
         return len(self._results)
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{name}: {one!r}' for name, one in self.items())})"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for place, (name, one) in enumerate(self.items()):

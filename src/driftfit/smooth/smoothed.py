@@ -15,6 +15,7 @@ from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.blocks import Blocks
 from driftfit.run.result import Track
 from driftfit.show.axes import BLUE, GREY, panels
+from driftfit.show.text import Printed, path_table
 from driftfit.smooth import exact, laws
 from driftfit.smooth.problem import walk_of
 from driftfit.smooth.solvers.walk import NONE, Path, Walk, ordered
@@ -54,7 +55,7 @@ class Fit(NamedTuple):
     c: Array
 
 
-class Smoothed:
+class Smoothed(Printed):
     """Parameters of a record, each estimated from the complete record.
 
     Attributes
@@ -154,9 +155,8 @@ class Smoothed:
             self.theta[unknown] = np.nan
         return self
 
-    def __repr__(self) -> str:
-        run = self.run
-        return f"Smoothed path of {len(run)} samples, {self._data.used} used: {run.model!r}, {run.tracker!r}"
+    def __rich__(self) -> Any:
+        return path_table(f"Smoothed by {self._data.used} samples", self.names, self.theta, self.std)
 
     @property
     def walk(self) -> Walk:

@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
 
 from driftfit.data.arguments import check_role
 from driftfit.data.record import Reading, Record
@@ -42,12 +41,12 @@ class Frontier(NamedTuple):
     measurement: Array
     dynamic: Array
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich__(self) -> Any:
         rows = some_rows(len(self.mu))
         table = table_of(f"Frontier, {len(rows)} of {len(self.mu)} weights", "mu", "measurement cost", "dynamic cost")
         for i in rows:
             table.add_row(*(f"{column[i]:.4g}" for column in self))
-        yield table
+        return table
 
     def plot(self, ax: Any = None) -> Figure:
         """r_M^2 against r_D^2, and both against mu; a matplotlib figure. ``ax`` as for `Track.plot`."""

@@ -150,6 +150,9 @@ def unknown_at_start(run: Track) -> int:
 
 
 def information(run: Track, settings: int, price: float | None = None) -> float:
-    """-2 log L + price p, with p the estimated settings and the unknown starts; the price is log N unless given."""
-    each = float(np.log(run.ok.sum())) if price is None else price
+    """-2 log L + price p, with p the estimated settings and the unknown starts; the price is log N unless given. NaN
+    without a sample that is used.
+    """
+    N = int(run.ok.sum())
+    each = (float(np.log(N)) if price is None else price) if N else float("nan")
     return -2.0 * run.loglik + each * (settings + unknown_at_start(run))

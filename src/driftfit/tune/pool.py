@@ -34,19 +34,20 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, plain, warn
 from driftfit.run.result import Track
-from driftfit.show.text import digits
+from driftfit.show.text import Printed, path_table
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.kalman import Kalman
 
 
 @dataclass(frozen=True, eq=False)
-class Pooled:
+class Pooled(Printed):
     """The prior of a fleet, and each unit under it.
 
     Attributes
@@ -78,12 +79,9 @@ class Pooled:
     tracker: Kalman
     loglik: float
 
-    def __repr__(self) -> str:
-        spread = ", ".join(
-            f"{name} {digits(mean, std)} +- {std:.2g}"
-            for name, mean, std in zip(self.names, self.mean, self.spread, strict=True)
-        )
-        return f"Pooled prior of {len(self.keys)} units: {spread}"
+    def __rich__(self) -> Any:
+        title = f"Prior of {len(self.keys)} units"
+        return path_table(title, ("mean",), self.mean[:, None], self.spread[:, None], self.names)
 
     @property
     def spread(self) -> Array:

@@ -235,9 +235,6 @@ def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data
 class TunedOutputs(ByOutput[Tuned]):
     """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
-    def __repr__(self) -> str:
-        return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
-
     @property
     def tracker(self) -> dict[str, Tracker]:
         """The tracker of each output, by name, ready for `track` and `Live`."""

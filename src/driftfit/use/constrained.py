@@ -29,7 +29,7 @@ import re
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,9 +37,10 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.conformal import quantile
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
+from driftfit.show.text import Printed, path_table
 
 
-class Constrained:
+class Constrained(Printed):
     """Parameters within constraints, sample by sample.
 
     Attributes
@@ -68,8 +69,8 @@ class Constrained:
                 self.prob[known, k] = ndtr((one.high - free @ one.g) / std) - ndtr((one.low - free @ one.g) / std)
         self.theta[known], self._P[known], self._left[known], self._spread[known] = cut(free, S, within)
 
-    def __repr__(self) -> str:
-        return f"Constrained theta of {len(self.theta)} samples: {', '.join(one.text for one in self.within)}"
+    def __rich__(self) -> Any:
+        return path_table(", ".join(one.text for one in self.within), self.names, self.theta, self.std)
 
     @cached_property
     def std(self) -> Array:

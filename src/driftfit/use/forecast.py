@@ -55,22 +55,20 @@ from driftfit.run.live.conformal import quantile
 from driftfit.run.live.live import Live
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
-from driftfit.show.text import digits, printed, table_of
+from driftfit.show.text import Printed, path_table
 from driftfit.use.system import spread
 
 if TYPE_CHECKING:
     import polars
 
 DRAWS = 200
-PRINTED = 10
-"""Samples of a forecast that are printed."""
 
 CENTRAL, BISECTIONS = math.erf(math.sqrt(0.5)), 60
 """Share of futures within one half-width; and steps of its computation."""
 
 
 @dataclass(frozen=True, eq=False)
-class Forecast:
+class Forecast(Printed):
     """The h samples after a record: parameters, and outputs with the distribution of their errors."""
 
     theta: Array
@@ -129,25 +127,13 @@ class Forecast:
             parts.append(pl.DataFrame(columns).select(*named, pl.all()))
         return in_zone(pl.concat(parts, how="diagonal"), self.axis, self.zone if self.time is not None else None)
 
-    def __repr__(self) -> str:
-        """A table of the first outputs, with their standard deviations."""
+    def __rich_console__(self, console: Any, options: Any) -> Any:
         h = len(self)
-        means, stds = self.y_hat.reshape(h, -1), self.y_std.reshape(h, -1)
-        table = table_of(
-            f"Forecast of {h} samples", "ahead" if self.time is None else self.axis,
-            *(head for name in self.outputs for head in (name, "+-")), group=2,
-        )  # fmt: skip
-        for k in range(min(h, PRINTED)):
-            pairs = zip(means[k].tolist(), stds[k].tolist(), strict=True)
-            table.add_row(
-                self.time_text(k), *(cell for mean, std in pairs for cell in (digits(mean, std), f"{std:.3g}"))
-            )
-        more = f" the first {PRINTED} of {h};" if h > PRINTED else ""
-        if np.isnan(means).all() and np.isfinite(self.theta).all():
-            more = f" future inputs are needed to forecast outputs: forecast({h}, u);{more}"
-        return printed(table, f"{more} +- one standard deviation; theta and std are those of the parameters").strip(
-            "\n"
-        )
+        means, stds, due = self.y_hat.reshape(h, -1), self.y_std.reshape(h, -1), [self.time_text(k) for k in range(h)]
+        yield path_table(f"Forecast of {h} samples", self.outputs, means, stds, due)
+        if np.isnan(self.y_hat).all() and np.isfinite(self.theta).all():
+            yield f" future inputs are needed to forecast outputs: forecast({h}, u)"
+        yield " +- one standard deviation; theta and std are those of the parameters"
 
     def of_record(self, run: Track | Outputs) -> Forecast:
         """The same with the times and names of a record that goes on."""

@@ -38,6 +38,7 @@ from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.polynomial import PolynomialModel
 from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track
+from driftfit.show.text import path_table, printing
 from driftfit.use.system import covariances, filtered, spread, taken
 
 
@@ -229,8 +230,9 @@ def _filled(values: Array) -> Array:
     return np.where(place >= 0, values[place], np.nan)
 
 
+@printing
 class Prediction(NamedTuple):
-    """Outputs with the distribution of their errors; NaN if inputs or lags are missing."""
+    """Outputs with the distribution of their errors, NaN if inputs or lags are missing; printing it shows a table."""
 
     y_hat: Array
     """(T,): at the predicted sample."""
@@ -240,6 +242,9 @@ class Prediction(NamedTuple):
     """(T,): standard deviation including the noise, the band of the output."""
     paths: Array | None = None
     """(D, T): drawn outputs, for models that are nonlinear in their parameters."""
+
+    def __rich__(self) -> Any:
+        return path_table("Prediction", ("y",), self.y_hat[:, None], self.y_std[:, None])
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of the output, (T,) each: normal, or quantiles of the drawn outputs."""

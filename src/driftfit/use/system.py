@@ -30,13 +30,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-from rich.console import Console, ConsoleOptions, RenderResult
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
 from driftfit.run.live.conformal import quantile
-from driftfit.show.text import printing, some_rows, table_of
+from driftfit.show.text import path_table, printing
 
 if TYPE_CHECKING:
     from driftfit.models.base import Model
@@ -73,16 +72,11 @@ class Response(NamedTuple):
     value: Array
     std: Array
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich__(self) -> Any:
         value, std = (np.reshape(part, (len(np.atleast_1d(part)), -1)) for part in self)
         value, std = (value.T, std.T) if len(value) == 1 else (value, std)
-        rows, each = some_rows(len(value)), range(value.shape[1])
-        heads = (name for k in each for name in (f"value {k + 1}" if len(each) > 1 else "value", "std"))
-        table = table_of(f"Response, {len(rows)} of {len(value)} rows", "", *heads, group=2)
-        for t in rows:
-            cells = ((f"{value[t, k]:.4g}", "" if np.isnan(std[t, k]) else f"{std[t, k]:.2g}") for k in each)
-            table.add_row(f"{t}", *(text for pair in cells for text in pair))
-        yield table
+        k = value.shape[1]
+        return path_table("Response", [f"value {i + 1}" for i in range(k)] if k > 1 else ["value"], value, std)
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of a normal approximation."""
@@ -90,14 +84,22 @@ class Response(NamedTuple):
         return self.value - half, self.value + half
 
 
+@printing
 class FrequencyResponse(NamedTuple):
-    """For one input: w (k,) in radians per sample; log magnitude and phase (radians), (T, k) each, with std."""
+    """For one input: w (k,) in radians per sample; log magnitude and phase (radians), (T, k) each, with std; printing
+    it shows that of the last sample.
+    """
 
     w: Array
     magnitude: Array
     log_magnitude_std: Array
     phase: Array
     phase_std: Array
+
+    def __rich__(self) -> Any:
+        size, log_std, phase, phase_std = (np.atleast_2d(part)[-1] for part in self[1:])
+        value, std = np.stack([size, phase], axis=1), np.stack([size * log_std, phase_std], axis=1)
+        return path_table("Response by w", ("magnitude", "phase"), value, std, [f"{w:.4g}" for w in self.w])
 
 
 class LongRun(NamedTuple):

@@ -219,7 +219,8 @@ def ramp(X: Array, y: Array, noise: tuple[Array, Array, Array], moves: Sequence[
     hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * X[:, None, moves]
     white = white_rows(hinges.reshape(N, -1), y, *noise)[0]
     white -= Q @ (Q.T @ white)
-    products, b = (white.T @ white).reshape(len(places), J, len(places), J), (z @ white).reshape(-1, J)
+    own = white.reshape(len(white), -1, J).transpose(1, 2, 0)  # corner by corner: too small for BLAS to start threads
+    products, b = (own @ white).reshape(len(places), J, len(places), J), own @ z
     i, j = np.triu_indices(len(places), 1)
     A = products[i, :, i] - products[i, :, j] - products[j, :, i] + products[j, :, j]
     b, long = b[i] - b[j], places[j] - places[i]
