@@ -73,9 +73,10 @@ def test_criteria_are_those_of_statsmodels_but_for_a_constant_of_the_diffuse_lik
     tested = likelihood_ratio(still, tuned)
     assert tested.statistic == pytest.approx(2 * (tuned.loglik - still.loglik))
     assert tested.p == pytest.approx(0.5 * chi2.sf(tested.statistic, 1))
+    assert likelihood_ratio(track(level, still.tracker, y), run, df=1).p == pytest.approx(tested.p)
     with pytest.raises(ValueError, match="restricted comes first"):
-        likelihood_ratio(tuned, still)
-    with pytest.raises(ValueError, match="samples; give both the same record"):
+        likelihood_ratio(run, run)
+    with pytest.raises(ValueError, match="samples have a likelihood; give both"):
         likelihood_ratio(tune(level, Kalman(q=0.0), y[1:]), tuned)
 
 

@@ -96,36 +96,35 @@ def wald(run: Track, *equations: str, at: int = -1, names: tuple[str, ...] = ())
     return Tested(null, W, "chi-square", (k,), float(chi2.sf(W, k)))
 
 
-def likelihood_ratio(restricted: Tuned, full: Tuned) -> Tested:
-    """Test the settings that are free in ``full`` alone, by the likelihoods of two tunings of the same record.
+def likelihood_ratio(restricted: Tuned | Track, full: Tuned | Track, df: int = 0) -> Tested:
+    """Test the settings that are free in ``full`` alone, by the likelihoods of two tunings or runs of the same record.
 
     The settings of the restricted tracker are part of those of the full one: `Kalman(q=0.0)` of ``Kalman()``, or one q
-    for all parameters of ``groups="each"``. ``Tested.df`` are the lowest and the highest degrees of freedom of the
-    mixture. ValueError for tunings by another criterion than "ml", of different samples, or none that is free in full
-    alone.
+    for all parameters of ``groups="each"``. A run does not know which of its settings were estimated: of runs with the
+    likeliest settings ``df`` says how many of ``full`` were that are given in ``restricted``. ``Tested.df`` are the
+    lowest and the highest degrees of freedom of the mixture. ValueError for tunings by another criterion than "ml", of
+    different samples, or none that is free in full alone.
     """
     from scipy.stats import chi2
 
-    if restricted.method != "ml" or full.method != "ml":
+    if any(getattr(one, "method", "ml") != "ml" for one in (restricted, full)):
         raise ValueError('likelihood_ratio: both tunings must be by method="ml".')
-    if restricted.used != full.used:
-        raise ValueError(
-            f"likelihood_ratio: the tunings use {restricted.used} and {full.used} samples; give both the same record."
-        )
-    free = full.settings - restricted.settings
+    a, b = (one.used if isinstance(one, Tuned) else np.isfinite(one.log_density).sum() for one in (restricted, full))
+    if a != b:
+        raise ValueError(f"likelihood_ratio: {a} and {b} samples have a likelihood; give both the same record.")
+    free = df or getattr(full, "settings", 0) - getattr(restricted, "settings", 0)
     if free < 1:
         raise ValueError(
-            f"likelihood_ratio: {full.settings} settings are free in full and {restricted.settings} in restricted; "
-            "restricted comes first."
+            f"likelihood_ratio: {free} more settings are free in full than in restricted; restricted comes first, and "
+            "of runs df= says how many settings of full were estimated that are given in restricted."
         )
-    still = np.asarray(getattr(restricted.tracker, "q", 1.0), dtype=float)
-    zeros = free if not still.any() else 0
+    zeros = 0 if np.any(getattr(restricted.tracker, "q", 1.0)) else free
     weights = np.array([comb(zeros, j) for j in range(zeros + 1)]) / 2.0**zeros
-    df = free - zeros + np.arange(zeros + 1)
+    each = range(free - zeros, free + 1)
     LR = max(2.0 * (full.loglik - restricted.loglik), 0.0)
-    p = float(sum(w * (chi2.sf(LR, k) if k else float(LR <= 0.0)) for w, k in zip(weights, df, strict=True)))
-    ends = (float(df[0]), float(df[-1])) if zeros else (float(free),)
-    return Tested(shortened(repr(restricted.tracker)), LR, "chi-square", ends, p)
+    p = float(sum(w * (chi2.sf(LR, k) if k else float(LR <= 0.0)) for w, k in zip(weights, each, strict=True)))
+    null = shortened(repr(restricted.tracker))
+    return Tested(null, LR, "chi-square", (each[0], each[-1]) if zeros else (free,), p)
 
 
 def constants(run: Track, **settings: Any) -> Any:
