@@ -197,22 +197,3 @@ def test_fault_codes_are_survived():
     assert "3 samples far outside the range" in str(run.summary())
     lasting = y + np.where(np.arange(400) >= 200, 1e5, 0.0)  # what keeps coming is believed
     assert track(ARX(1, 1, intercept=True), Bank(), lasting, u).ok[205:].all()
-
-
-def test_the_bound_of_a_beam_is_found_among_large_numbers():
-    """The bits of two numbers above 2 overflow when they are added."""
-    from driftfit.bank.reducing import selection
-
-    values, M = np.zeros((1, 72)), 45
-    values[0, :66] = np.r_[np.full(40, 4.0), np.linspace(2.0, 3.0, 26)]
-    from driftfit.engine.kernel import Driver
-
-    bound = selection.bound
-
-    @Driver
-    def found(V, out):
-        out[0] = bound(V, 0, 66, 45)
-
-    out = np.zeros(1)
-    found(values, out)
-    assert (values[0] >= out[0]).sum() == M

@@ -32,8 +32,7 @@ from driftfit import (
 )  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
-from driftfit.embedded.functions import translation
-from driftfit.embedded.project import record
+from driftfit.embedded.project import record, translation
 from driftfit.embedded.values import TranslationError
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import kernel
@@ -527,3 +526,14 @@ def test_readme_and_header_say_what_there_is(tmp_path):
     assert 60 <= int(counted[2]) <= 110
     assert "#define TRACKER_PARAMETERS 4" in header
     assert "malloc" not in (tmp_path / "tracker.c").read_text()
+
+
+def test_the_page_says_what_a_plan_takes(tmp_path):
+    words = ["--model", "ARX(2, 2, nk=0)", "--tracker", "Kalman(q=1e-3, r=0.1)", "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, ["export", "c", *words, "--horizon", "8"]).exit_code == 0
+    readme, page = (tmp_path / "README.md").read_text(), (ROOT / "docs" / "embedded.md").read_text()
+    size = re.search(r"structure of (\d+) bytes", readme)[1]
+    most = re.search(r"and then at most (\d+) multiplications", readme)[1]
+    assert f"{int(size) // 1000} kB of working space, and at most {round(int(most) / 1000)} thousand" in page
+    with pytest.raises(ValueError, match="export_c: needs a stream of an ARX model"):
+        export_c(Regression(1), Kalman(q=1e-3, r=0.1), tmp_path, horizon=8)

@@ -138,7 +138,7 @@ class Change(Settings):
         """(n, n): the numbers that the module stores of it; covariances are multiplied by ``unit``."""
         rows = np.zeros((n, n))
         if self.anchor is not None:
-            rows = forget.anchors_of(matrix("Change", "anchor", self.anchor, n) * unit)
+            rows = np.linalg.inv(np.linalg.cholesky(matrix("Change", "anchor", self.anchor, n) * unit))  # W'W = A^-1
         elif self.resets_some:
             rows = np.eye(n)
             rows[list(self.which), list(self.which)] = 0.0

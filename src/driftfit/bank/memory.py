@@ -163,7 +163,4 @@ def _whole_vectors(size: int) -> int:
 
 def _padded(x: Array, least: int) -> Array:
     """The array, extended with zeros to one of a few sizes."""
-    size = least
-    while size < len(x):
-        size *= 2
-    return np.concatenate([x, np.zeros(size - len(x))])
+    return np.pad(x, (0, (least << ((len(x) - 1) // least).bit_length()) - len(x)))

@@ -163,9 +163,11 @@ def to_c(
     own: Own = None,
     fixed_rate: Annotated[bool, Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,
     gate: Annotated[bool | None, Option("--gate/--no-gate", help="Judge readings first.")] = None,
+    horizon: Annotated[int | None, Option(help="Samples for which inputs are planned, too.")] = None,
 ) -> None:
     """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
-    export_c(parse_model(model), parse_tracker(tracker, p or [], own), out, fixed_rate=fixed_rate, gate=gate)
+    made = parse_model(model), parse_tracker(tracker, p or [], own)
+    export_c(*made, out, fixed_rate=fixed_rate, gate=gate, horizon=horizon)
     readme = (out / "README.md").read_text(encoding="utf-8")
     state = readme.split("State: ")[1].split(".")[0]
     say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))

@@ -11,8 +11,7 @@ from os import PathLike
 from pathlib import Path
 
 from driftfit.data.arguments import check_ready
-from driftfit.embedded.functions import translation
-from driftfit.embedded.project import files_of, write
+from driftfit.embedded.project import files_of, translation, write
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate

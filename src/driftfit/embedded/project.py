@@ -4,21 +4,176 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from driftfit.embedded.functions import FACTORS, Translation, translation
-from driftfit.embedded.values import as_code, assigned, comment, identifier, number
+from driftfit.data.storage import fields
+from driftfit.embedded.functions import passed, translate
+from driftfit.embedded.values import (
+    Function,
+    Unit,
+    Value,
+    as_code,
+    assigned,
+    begin_of,
+    comment,
+    identifier,
+    number,
+    strides_of,
+)
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES
 from driftfit.readings.first_samples import U as INPUTS
 from driftfit.readings.gate import Gate
-from driftfit.run.program import Program
+from driftfit.run.program import Program, State
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
+from driftfit.use.planning import plan, room, spread_of_state, terms_of
+
+FACTORS = ("interval", "noise", "drift")
+"""Fields that describe the next sample."""
+
+RESULTS = ("theta", "var")
+
+
+@dataclass(frozen=True)
+class Planning:
+    """Planning inputs: the fields of its structure with their shapes, calls that return points of theta at sample k and
+    a plan, and the operations of both."""
+
+    fields: dict[str, tuple[int, ...]]
+    points: str
+    plan: str
+    operations: tuple[Counter[str], Counter[str]]
+
+
+@dataclass(frozen=True)
+class Translation:
+    """The functions in C, the one that takes a sample, the operations of an ordinary sample after the start, and the
+    record's fields that the structure has."""
+
+    unit: Unit
+    entry: Function
+    ordinary: Counter[str]
+    names: tuple[str, ...]
+    scratch: tuple[str, ...]
+    planning: Planning | None = None
+
+    @property
+    def start(self) -> Array:
+        """The record before the first sample."""
+        return self.unit.record
+
+    def type_of(self, name: str) -> str:
+        """The type of a field's numbers in C."""
+        if name in self.unit.flags:
+            return "int"
+        return "int64_t" if self.start[name].dtype.kind == "i" else "tracker_real"
+
+    def layout(self, real: int) -> np.dtype[Any]:
+        """The structure as the C compiler lays it out, when a real number has so many bytes."""
+        types = {"int": "i4", "int64_t": "i8", "tracker_real": f"f{real}"}
+        return np.dtype([(name, types[self.type_of(name)], self.start.dtype[name].shape[:-1]) for name in self.names],
+                        align=True)  # fmt: skip
+
+    def bytes_of(self, state: State) -> bytes:
+        """The structure of the double-precision build with this state.
+
+        Raises
+        ------
+        ValueError
+            If a field whose value is a constant in C has another value.
+        """
+        for name in sorted(self.unit.replaced):
+            if not np.array_equal(state[name], self.start[name][0, ..., 0], equal_nan=True):
+                raise ValueError(
+                    f"to_struct: the field {name!r} is {state[name].tolist()} in this stream; the exported tracker "
+                    f"has {self.start[name][0, ..., 0].tolist()} as a constant."
+                )
+        structure = np.zeros(1, self.layout(8))
+        for name in self.names:
+            structure[name][0] = state[name]
+        return structure.tobytes()
+
+    def read(self, state: State, data: bytes) -> None:
+        """Write the structure's bytes into the fields of a record."""
+        structure = np.frombuffer(data, self.layout(8))
+        for name in self.names:
+            state[name][...] = structure[name][0]
+
+
+@lru_cache(maxsize=16)
+def translation(program: Program, fixed_rate: bool = False, horizon: int | None = None) -> Translation:
+    """Translate the steps of a model and a tracker, and what plans inputs for ``horizon`` samples.
+
+    A field that no step writes keeps the value that it starts with. Where all its entries are equal, that value becomes
+    a constant of the text, and branches that it excludes are left out. A field to which steps assign only 0 and 1
+    becomes an integer, because comparing numbers in double precision takes 50 cycles on a processor that does it in
+    software. To find these fields we assume that none is written, and that all contain 0 or 1, translate, give up the
+    assumptions that turned out wrong, and repeat until none does. Everything that the caller may change remains a
+    field: the settings of the tracker and, unless the samples come at a fixed rate, the known factors of the next one.
+    """
+    tile = program.tile()
+    update = program.drivers().update.function
+    u = Value("array", "u", shape=(program.model.m,), strides=(1,))
+    factors = () if fixed_rate else FACTORS
+    constant = frozenset(fields(tile)) - {*factors, *RESULTS, *program.tracker.settings()}
+    flags = frozenset(name for name in constant if _may_be_flag(tile[name][0]))
+    scratch = frozenset(program.scratch) & {*fields(tile)}
+    while True:
+        unit, ordinary = (Unit(tile, constant, flags, scratch, ordinary) for ordinary in (False, True))
+        entry, usual = (translate(one, update, [Value("tile"), Value("real", "y"), u]) for one in (unit, ordinary))
+        if not (constant & unit.written or flags & unit.beyond):
+            break
+        constant, flags = constant - unit.written, flags - unit.beyond
+    planning = None if horizon is None else _planning(program, unit, horizon)
+    text = "\n".join(function.text for function in unit.functions.values())
+    read = {*re.findall(r"\bs->(\w+)", text), *factors, *RESULTS}
+    names = [name for name in fields(tile) if identifier(name) in read]
+    names.sort(key=lambda name: name in flags)  # no gaps: integers last
+    return Translation(unit, entry, usual.operations, tuple(names), tuple(sorted(scratch)), planning)
+
+
+def _planning(program: Program, unit: Unit, h: int) -> Planning:
+    """Translate `driftfit.use.planning`; everything that is chosen on the controller is a field of the structure."""
+    model: Any = program.model
+    m, own = model.m, room(model, program.tracker, h)
+    shapes: dict[str, tuple[int, ...]] = {
+        "target": (h,), "given": (h, m), "low": (m,), "high": (m,), "move": (m,), "effort": (), "caution": (),
+        "probe": (), **own, "P": (model.n, model.n),
+    }  # fmt: skip
+    p = {
+        name: Value("array" if shape else "real", f"p->{name}", shape=shape, strides=strides_of(shape))
+        for name, shape in shapes.items()
+    }
+    lags, wanted, limits, work = (
+        Value("items", constant=list(one))
+        for one in (map(_without_lane, (unit.field("y_lag"), unit.field("u_lag"))), (p["target"], p["given"]),
+                    (p["low"], p["high"], p["move"]), (p[name] for name in own))
+    )  # fmt: skip
+    looking = [Value("record"), p["P"], p["caution"], Value("int", "k"), p["points"]]
+    planned = [Value("table", constant=terms_of(model)), lags, number(0), wanted, limits, p["effort"], p["probe"], work]
+    calls, operations = [], []
+    for source, arguments in ((spread_of_state, looking), (plan.function, planned)):
+        made = translate(unit, source, arguments)
+        calls.append(f"{made.name}({', '.join(text for one in arguments if (text := passed(one)))})")
+        operations.append(made.operations)
+    return Planning(shapes, calls[0], calls[1], (operations[0], operations[1]))
+
+
+def _without_lane(field: Value) -> Value:
+    return Value("array", begin_of(field), shape=field.shape[:-1], strides=field.strides[:-1])
+
+
+def _may_be_flag(start: Array) -> bool:
+    """Whether a field is one floating-point number that starts as 0 or 1."""
+    return start.size == 1 and start.dtype.kind == "f" and start.item() in (0.0, 1.0) and not np.signbit(start.item())
+
 
 PLACE = Path(__file__).parent / "c"
 """Texts of the files, in which a name between two @ stands for what is written there."""

@@ -111,10 +111,9 @@ def control(
     low, high, step = (np.array(np.broadcast_to(np.asarray(one, float), model.m)) for one in (*ends, most))
     work = {name: np.zeros(shape) for name, shape in room(model, tracker, horizon).items()}
     _look_ahead(live, lane, c, work["points"])
-    why = plan(
-        terms_of(model), lane["y_lag"], lane["u_lag"], late, np.array(goal, float), np.array(given, float), low, high,
-        step, cost, share, *work.values(),
-    )  # fmt: skip
+    wanted = np.array(goal, float), np.array(given, float)
+    lags = lane["y_lag"], lane["u_lag"]
+    why = plan(terms_of(model), lags, late, wanted, (low, high, step), cost, share, tuple(work.values()))
     if why == len(HELD):
         raise ValueError("control: the inputs given as u= leave none within the limits and moves.")
     chosen = work["u"]

@@ -23,7 +23,7 @@ came within 1e-6 of the least J, after 23 sweeps on average; the others lacked a
 
 
 def room(model: ARX, tracker: Any, h: int) -> dict[str, tuple[int, ...]]:
-    """The last arguments of `plan`, results and working arrays, with their shapes."""
+    """What `plan` works in: results and working arrays, with their shapes."""
     S, m = 2 * model.n if tracker.covariance else 1, model.m
     return {
         "u": (h, m), "y_hat": (h,), "theta_std": (h,), "points": (S, h, model.n), "rest": (S, h),
@@ -159,19 +159,10 @@ def start_within(
 
 @shared
 def curvature(
-    rest: Array,
-    effect: Array,
-    outputs: Array,
-    target: Array,
-    last: Array,
-    effort: float,
-    v: Array,
-    slope: Array,
-    H: Array,
+    effect: Array, outputs: Array, target: Array, last: Array, effort: float, v: Array, slope: Array, H: Array
 ) -> None:
     """H and the slope of J / 2 at v, for the sum over the points."""
-    S, h, m, dearest = rest.shape[0], v.shape[0], v.shape[1], 0.0
-    outcome(rest, effect, v, outputs)
+    S, h, m, dearest = outputs.shape[0], v.shape[0], v.shape[1], 0.0
     for e in range(h):
         for j in range(m):
             slope[e, j] = 0.0
@@ -238,10 +229,8 @@ def sweep(
 
 
 @shared
-def probing(
-    probe: float, effect: Array, outputs: Array, last: float, move: float, least: float, most: float, j: int, v: float
-) -> float:  # fmt: skip
-    """The first value v of input j, moved to where it tells more."""
+def probing(probe: float, effect: Array, outputs: Array, low: float, high: float, j: int, v: float) -> float:
+    """The first value v of input j, moved to where it tells more, between low and high."""
     S, h = outputs.shape
     uncertain, power, acts = 0.0, 0.0, -1
     for k in range(h - 1, -1, -1):
@@ -252,20 +241,21 @@ def probing(
     if acts < 0:
         return v
     d = np.sqrt(probe * uncertain / power)
-    low, high = max(least, last - move), min(most, last + move)
     less, more = min(max(v - d, low), high), min(max(v + d, low), high)
     told = moments(outputs, effect, acts, j, more - v)[1] > moments(outputs, effect, acts, j, less - v)[1]
-    return more if told else less
+    return float(more if told else less)
 
 
 @Driver
-def plan(
-    terms: Array, y_lag: Array, u_lag: Array, late: int, target: Array, given: Array, lower: Array, upper: Array,
-    move: Array, effort: float, probe: float, v: Array, y_hat: Array, theta_std: Array, points: Array, rest: Array,
-    effect: Array, outputs: Array, last: Array, least: Array, most: Array, slope: Array,
-    column: Array, H: Array
-) -> int:  # fmt: skip
-    """Inputs v (h, m) from points of theta, lags, wanted outputs (h,) and limits (m,); see `room` and `HELD`."""
+def plan(terms: Array, lags: Any, late: int, wanted: Any, limits: Any, effort: float, probe: float, work: Any) -> int:
+    """Inputs v (h, m) from points of theta. ``lags`` are those of outputs and inputs, ``wanted`` outputs (h,) and the
+    inputs that are given (h, m), ``limits`` the lowest and highest inputs and their largest move (m,); see `room` for
+    ``work``, and `HELD` of `control` for what is returned.
+    """
+    y_lag, u_lag = lags
+    target, given = wanted
+    lower, upper, move = limits
+    v, y_hat, theta_std, points, rest, effect, outputs, last, least, most, slope, column, H = work
     h, m = v.shape
     for j in range(m):
         one = u_lag[j, late]
@@ -282,7 +272,8 @@ def plan(
         return 2
     if not start_within(given, last, lower, upper, move, least, most, v):
         return 3
-    curvature(rest, effect, outputs, target, last, effort, v, slope, H)
+    outcome(rest, effect, v, outputs)
+    curvature(effect, outputs, target, last, effort, v, slope, H)
     for _turn in range(SWEEPS):
         largest = 0.0
         moved = sweep(H, slope, column, last, move, least, most, v)
@@ -294,7 +285,8 @@ def plan(
     for j in range(m):
         outcome(rest, effect, v, outputs)
         if probe > 0.0 and least[0, j] < most[0, j]:
-            v[0, j] = probing(probe, effect, outputs, last[j], move[j], least[0, j], most[0, j], j, v[0, j])
+            low, high = max(least[0, j], last[j] - move[j]), min(most[0, j], last[j] + move[j])
+            v[0, j] = probing(probe, effect, outputs, low, high, j, v[0, j])
     outcome(rest, effect, v, outputs)
     for k in range(h):
         mean, variance = moments(outputs, effect, k, 0, 0.0)

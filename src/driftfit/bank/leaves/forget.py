@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from driftfit.bank.leaves.leaf_matrix import FIRST, spread
 from driftfit.engine.kernel import Array, exp, part, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, times
@@ -249,8 +247,3 @@ def foresee(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Fill the rows z'C z and z'm of `expected` for every leaf over all changes, and m and C."""
     average(t, L, Hd, Hm)
     spread(t.C, t.z, t.m, L, t.n, t.output_lags, t.g, t.expected)
-
-
-def anchors_of(covariance: Array) -> Array:
-    """W with W'W = A^-1, (n, n)."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

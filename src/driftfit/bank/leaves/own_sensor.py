@@ -20,7 +20,7 @@ import numpy as np
 from numba import types
 
 from driftfit.bank.layout import ROW
-from driftfit.bank.leaves.leaf_matrix import NU, S, lag_row
+from driftfit.bank.leaves.leaf_matrix import NU, S
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.numba_internals import ir, named_intrinsic
 from driftfit.engine.simd import WIDTH
@@ -95,13 +95,6 @@ def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -
             judge(t, which, at, l, y, r, answer)
             t.scores[0, l], clean[l] = answer[LOG_P], answer[CLEAN]
         t.scores[2, l] = answer[NOISE]
-
-
-@shared
-def clean_lags(t: Any, at: int, columns: int) -> None:
-    """The output that the function returned is the newest lag."""
-    for l in range(columns):
-        t.leaves[lag_row(t), at + l] = t.answers[0, l]
 
 
 @cache

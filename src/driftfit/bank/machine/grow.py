@@ -23,8 +23,8 @@ import numpy as np
 from driftfit.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply, predicted
 from driftfit.bank.leaves.lags import push, shift_covariance, widen_by_lags
-from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.bank.leaves.own_sensor import clean_lags, judge_all
+from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, lag_row, regressors, spread
+from driftfit.bank.leaves.own_sensor import judge_all
 from driftfit.engine.kernel import Array, log, part, shared, sized
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.forms.covariance import LEFT
@@ -242,7 +242,8 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             push(t, t.parents, K, at, columns, y - sensors[j, VALUE], own_lags)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
         if sensors[j, OWN] > 0.0 and sensors[j, CLEANS] > 0.0 and t.output_lags > 0:
-            clean_lags(t, at, columns)
+            for l in range(columns):  # the output that the function returned is the newest lag
+                t.leaves[lag_row(t), at + l] = t.answers[0, l]
         # prior probability of the event, ancestry, and codes for the reduction
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

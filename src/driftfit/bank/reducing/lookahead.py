@@ -113,5 +113,4 @@ def integrate(parts: Array, count: int, loss: Array, f: Array) -> float:
 @shared
 def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array, samples: int) -> float:
     """ER_s for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
-    count = density_parts(t, L, top, mass, phi, samples)
-    return float(integrate(t.components, count, t.loss, t.scratch[2]))
+    return float(integrate(t.components, density_parts(t, L, top, mass, phi, samples), t.loss, t.scratch[2]))

@@ -13,7 +13,6 @@ import numpy as np
 from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, LOG, SENSORS, WEIGHT
 from driftfit.bank.reducing.lookahead import expected_risk
 from driftfit.engine.kernel import Array, kernel, log, shared
-from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, sum_of
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER, RESAMPLE = range(7)
 """Kinds of reduction."""
@@ -23,64 +22,39 @@ STEP, MIX, MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9),
 """Constants of the random numbers splitmix64 (Steele, Lea and Flood 2014)."""
 
 
-@kernel
-def reached(V: Array, row: int, count: int, value: float) -> float:
-    """How many entries of a row are at least ``value``."""
-    sums = fill(0.0)
-    for l in range(0, count, WIDTH):
-        sums = plus(sums, reaches(load(V, row, l), fill(value)))
-    return float(sum_of(sums))
-
-
 @shared
-def bound(V: Array, row: int, count: int, M: int) -> float:
-    """The M-th largest entry of a row, or any number between it and the next; 0 if no more than M are positive.
-
-    By bisection of the bits, which are in the order of the numbers: a dozen counts, each without branches,
-    are faster than a selection that jumps about.
-    """
-    low, high = np.int64(1), np.int64(0x7FF0000000000000)
-    if reached(V, row, count, np.int64(low).view(np.float64)) <= M:
-        return 0.0
-    while high - low > 1:
-        middle = low + (high - low) // 2  # of numbers above 2 the sum of the bits would overflow
-        many = reached(V, row, count, np.int64(middle).view(np.float64))
-        low = middle if many >= M else low
-        high = high if many >= M else middle
-        if many == M:
-            break
-    return float(np.int64(low).view(np.float64))
-
-
-@shared
-def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array) -> int:
-    """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. The rest of the row, up to the end of a SIMD vector, must be zero.
-    """
-    value, over, G, least = V[row], 0, 0, bound(V, row, count, M)
-    for l in range(count):
-        over += 1 if value[l] > least else 0
-    ties = M - over if least > 0.0 else 0
-    for l in range(count):
-        tie = 1 if value[l] == least and ties > 0 else 0
-        keep = tie + (1 if value[l] > least else 0)
-        ties -= tie
-        group[l], order[G] = G if keep > 0 else -1, l
-        G += keep
+def number(group: Array, L: int, order: Array) -> int:
+    """Number those that are in some group in their order; returns how many there are."""
+    G = 0
+    for l in range(L):
+        keep = group[l] >= 0
+        group[l], order[G] = G if keep else -1, l
+        G += 1 if keep else 0
     return G
 
 
-@kernel
-def clear(V: Array, row: int, count: int) -> None:
-    """Zeros after the first entries, up to the end of a SIMD vector."""
-    for l in range(count, min(count + WIDTH, V.shape[1])):
-        V[row, l] = 0.0
+@shared
+def heaviest(value: Array, count: int, M: int, group: Array, order: Array) -> int:
+    """Number the M largest positive values in their order, ties by their order; -1 for the rest. Returns how many."""
+    G = 0
+    for l in range(count):
+        at = G if value[l] > 0.0 else M
+        while 0 < at <= G and value[order[at - 1]] < value[l]:
+            at -= 1
+        if at < M:
+            for k in range(min(G, M - 1), at, -1):
+                order[k] = order[k - 1]
+            order[at], G = l, min(G + 1, M)
+        group[l] = -1
+    for k in range(G):
+        group[order[k]] = 0
+    return int(number(group, count, order))
 
 
 @shared
 def beam(t: Any, L: int) -> int:
     """The heaviest leaves."""
-    return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order))
+    return int(heaviest(t.leaves[WEIGHT], L, int(t.reduction[LEAVES]), t.group, t.order))
 
 
 @kernel
@@ -126,54 +100,46 @@ def resample(t: Any, L: int) -> int:
 
 
 @shared
-def merge(t: Any, L: int) -> int:
-    """Merge leaves with the same code; codes are numbered in the order of their appearance."""
-    B, group, slots, G = t.leaves, t.group, t.slots, 0
-    for l in range(L):
-        slots[int(B[CODE, l])] = -1
+def joined(t: Any, L: int, key: Array, own: Array, mass: Array) -> int:
+    """Leaves with the same ``key`` form a group, numbered in the order of their appearance; returns how many. The
+    groups have keys ``own`` and weights ``mass``.
+    """
+    group, slots, size, G, w = t.group, t.slots, len(t.slots), 0, t.leaves[WEIGHT]
+    for k in range(size):
+        slots[k] = -1
     for l in range(L):
         group[l] = -1
-        if B[WEIGHT, l] > 0.0:
-            code = int(B[CODE, l])
-            if slots[code] < 0:
-                slots[code] = G
+        if w[l] > 0.0:
+            place = int(key[l]) * 2654435761 % size  # a hash table with open addressing
+            while slots[place] >= 0 and own[slots[place]] != key[l]:
+                place = (place + 1) % size
+            if slots[place] < 0:
+                slots[place], own[G], mass[G] = G, key[l], 0.0
                 G += 1
-            group[l] = slots[code]
+            group[l] = slots[place]
+            mass[slots[place]] += w[l]
     return G
+
+
+@shared
+def merge(t: Any, L: int) -> int:
+    """Merge leaves with the same code."""
+    return int(joined(t, L, t.leaves[CODE], t.scratch[1], t.scratch[0]))
 
 
 @shared
 def hybrid(t: Any, L: int) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of the results."""
-    B, group, slots, X, bases = t.leaves, t.group, t.slots, t.scratch, t.bases
-    cap, M, size, G = t.reduction[CAP], int(t.reduction[LEAVES]), len(t.slots), 0
-    mass, key, renumber = X[0], X[1], X[3]
-    for k in range(size):
-        slots[k] = -1
+    B, group, kept, bases, cap, M = t.leaves, t.group, t.slots, t.bases, t.reduction[CAP], int(t.reduction[LEAVES])
+    mass, own, key = t.scratch[0], t.scratch[1], t.scratch[2]
     for l in range(L):
-        group[l] = -1
-        if B[WEIGHT, l] <= 0.0:
-            continue
-        mine = (B[CHANGES, l] * bases[1] + B[SENSORS, l]) * (cap + 1.0) + min(B[AGE, l], cap)
-        place = int(mine) * 2654435761 % size  # a hash table with open addressing
-        while slots[place] >= 0 and key[slots[place]] != mine:
-            place = (place + 1) % size
-        if slots[place] < 0:
-            slots[place], key[G], mass[G] = G, mine, 0.0
-            G += 1
-        group[l] = slots[place]
-        mass[slots[place]] += B[WEIGHT, l]
+        key[l] = (B[CHANGES, l] * bases[1] + B[SENSORS, l]) * (cap + 1.0) + min(B[AGE, l], cap)
+    G = joined(t, L, key, own, mass)
     if G > M:
-        for k in range(G):
-            slots[k] = 0
-        clear(X, 0, G)
-        kept = heaviest(X, 0, G, M, slots, t.order)
-        for k in range(G):
-            renumber[k] = slots[k]
+        M = heaviest(mass, G, M, kept, t.order)
         for l in range(L):
-            group[l] = int(renumber[group[l]]) if group[l] >= 0 else -1
-        return int(kept)
-    return G
+            group[l] = kept[group[l]] if group[l] >= 0 else -1
+    return int(min(G, M))
 
 
 @shared
@@ -255,14 +221,3 @@ def decide(t: Any, L: int, phi: Array) -> None:
                     group[l] = -1
         held -= 1
     t.held = held
-
-
-@shared
-def number(group: Array, L: int, order: Array) -> int:
-    """Groups of single leaves in their order."""
-    G = 0
-    for l in range(L):
-        keep = group[l] >= 0
-        group[l], order[G] = G if keep else -1, l
-        G += 1 if keep else 0
-    return G

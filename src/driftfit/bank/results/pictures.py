@@ -76,7 +76,7 @@ def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:
     for d in range(depth):
         width = H ** (depth - 1 - d)
         for code in range(H ** (d + 1)):
-            path = digits(code, H, d + 1)
+            path = tuple(map(int, np.unravel_index(code, (H,) * (d + 1))))
             height[path] = code * width + (width - 1) / 2.0
             mass = float(weights[codes // width == code].sum())
             axis.plot(
@@ -96,8 +96,3 @@ def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:
             axis.annotate(text, (depth + 0.08, -code), fontsize=7, va="center", color=GREY)
     axis.set_xlim(-0.1, depth + 1.6)
     return figure
-
-
-def digits(code: int, base: int, count: int) -> tuple[int, ...]:
-    """Digits of a number, the most significant first."""
-    return tuple(code // base**k % base for k in range(count - 1, -1, -1))

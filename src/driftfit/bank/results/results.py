@@ -17,7 +17,7 @@ from driftfit.bank.bank import Bank
 from driftfit.bank.layout import COUNTER
 from driftfit.bank.memory import SINGLE
 from driftfit.bank.reduction import Decide
-from driftfit.bank.results.events import Event, Probabilities, all_of
+from driftfit.bank.results.events import Event, Probabilities, all_of, runs
 from driftfit.bank.results.mixture import Mixture, mixture_of, undecided
 from driftfit.bank.results.pictures import plot_hypotheses
 from driftfit.bank.results.smoothed import SmoothedMixture
@@ -238,12 +238,12 @@ class Hypotheses:
             assert rate is not None
             threshold = self._threshold(rate, reference)
         on = self.window > threshold
-        return Alarm(float(threshold), onsets(on), on)
+        return Alarm(float(threshold), np.array([a for a, _ in runs(on)], int), on)
 
     def _threshold(self, rate: float, reference: Track | None) -> float:
         window = self.window if reference is None else Hypotheses(reference).window
         for level in np.unique(np.r_[0.0, np.round(window, 4), 1.0]):
-            at = onsets(window > level)
+            at = [a for a, _ in runs(window > level)]
             false = len(at) if reference is not None else float(np.sum(1.0 - window[at]))
             if false <= rate * len(window) and (reference is not None or level >= rate):
                 return float(level)
@@ -259,8 +259,3 @@ class Hypotheses:
         ``ax`` as for `Track.plot`.
         """
         return plot_hypotheses(self.run, self.latest, self.names, self.found(threshold), level, ax)
-
-
-def onsets(on: Array) -> Array:
-    """Samples at which a condition begins to hold."""
-    return np.flatnonzero(on & ~np.r_[False, on[:-1]])
