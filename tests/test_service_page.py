@@ -223,7 +223,7 @@ def test_a_unit_from_a_file(client):
     found = json.loads(body)
     assert status == 200
     assert found["headline"].startswith("The effect of pressure on flow")
-    assert 'name = "___pump_7"' in found["unit"]
+    assert 'match = "___pump_7"' in found["unit"]
     assert found["page"].startswith("<!doctype html>")
     for query, text in (("y=level", "no column 'level'"), ("y=--help", "no column '--help'"), ("", "")):
         status, body = ask("POST", f"/api/identify?{query}", pump.read_bytes()[:3000] if query else b"\x00garbage")

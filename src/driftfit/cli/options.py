@@ -111,7 +111,7 @@ def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
 
 
-def parse_interval(text: str | None, option: str = "--dt") -> float | str | None:
+def parse_interval(text: str | None) -> float | str | None:
     """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
     if text is None:
         return None
@@ -122,7 +122,7 @@ def parse_interval(text: str | None, option: str = "--dt") -> float | str | None
     try:
         Clock.of(given)
     except ValueError as error:
-        raise ValueError(f"{option} {text}: {error}") from None
+        raise ValueError(f"--dt {text}: {error}") from None
     return given
 
 

@@ -1,7 +1,5 @@
-"""A notice that the compiler is working, shown when a user has to wait for it: one line on stderr after two seconds,
-once per process.
-
-Only where somebody looks: on a terminal, or in a notebook. Output to a file or a program is not changed.
+"""A notice that the compiler is working, for whoever waits for it on a terminal or in a notebook: one line on stderr
+after two seconds, once per process. Output to a file or a program is not changed.
 """
 
 from __future__ import annotations
@@ -41,6 +39,9 @@ def compiling() -> Iterator[None]:
     try:
         yield
     finally:
+        if collecting and not gc.get_freeze_count():
+            gc.freeze()  # what the compiler made is old at once, so that the next collection does not visit it
+            gc.unfreeze()
         if collecting:
             gc.enable()
         if timer is not None:

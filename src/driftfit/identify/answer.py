@@ -36,6 +36,8 @@ LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
 RATE, LEAST = 50_000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
+LAST = "time or working point"
+"""What is being done once the record is tracked."""
 WORST = 3
 """Records of a fleet that have a page."""
 
@@ -153,8 +155,7 @@ class _Task:
             return found, structure
         of = str(sizes[0]) if found.by is None else "every record"
         short = f"only the last {most} samples of {of} were judged (--budget)"
-        narrowed = "; ".join(filter(None, (structure.narrowed, short)))
-        return found.last(most), replace(structure, narrowed=narrowed)
+        return found.last(most), replace(structure, narrowed=(*structure.narrowed, short))
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
         """The answer for one record."""
@@ -162,7 +163,7 @@ class _Task:
         self.progress("tracking")
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
         known = Evidence(run, level=self.level)
-        self.progress("time or working point")
+        self.progress(LAST)
         y, U, place = replace(found, y=run.used_record.y).spread(structure.na + 40)
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
@@ -215,7 +216,7 @@ def _of_data(found: Roles, structure: Structure) -> tuple[str, ...]:
         *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
         *([f"missing readings: {found.missing}"] if found.missing else []),
         *([f"rows without a time of their own, left out: {found.dropped}"] if found.dropped else []),
-        *([structure.narrowed] if structure.narrowed else []),
+        *structure.narrowed,
     )
 
 

@@ -99,11 +99,11 @@ def mixed(y: Array, errors: Array, h: int) -> Array:
     before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
     v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
     with np.errstate(over="ignore"):
-        worth = np.where(count > LEAST, (squares[1] - squares[0]) / (2.0 * v), 0.0)
+        worse = np.exp(np.where(count > LEAST, (squares[0] - squares[1]) / (2.0 * v), 0.0))
     weights = [0.5] * h
-    for ratio in np.exp(np.clip(worth, -50.0, 50.0)).tolist():
+    for ratio in worse.tolist():
         w = weights[-1]
-        weights.append(SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (1.0 - w + w * ratio))
+        weights.append(SHARE + (1.0 - 2.0 * SHARE) / (1.0 + (1.0 - w) / w * ratio))
     share = np.array(weights[: len(y)])
     found: Array = share * e[0] + (1.0 - share) * e[1]
     return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -61,8 +60,7 @@ SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": l
 """JSON Schema of `ManyIdentified.json`."""
 SERVICE = '[source.web]\nkind = "http"\n\n'
 """What a configuration of a service needs beside a unit: samples come by HTTP."""
-SPLIT = re.compile(r" (--model|--quiet)")
-"""Where a long line to copy is continued in the next."""
+WEEKLY = '{ every = "1 week" }'
 CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
 its 95 % band, from the past only. Red: when it changed."""
 
@@ -105,9 +103,8 @@ def others(answer: Identification) -> list[str]:
     names, moving = answer.roles.inputs, {move.what for move in answer.moves}
     steady = [names[j] for j in sorted(answer.structure.lags) if names[j] not in moving]
     idle = [name for j, name in enumerate(names) if j not in answer.structure.lags]
-    matter, do = "matters and is" if len(steady) == 1 else "matter and are", "does" if len(idle) == 1 else "do"
-    said = (steady and f"; {', '.join(steady)} {matter} constant", idle and f"; {', '.join(idle)} {do} not matter")
-    return [one for one in said if one]
+    said = (steady, ("matters and is", "matter and are"), " constant"), (idle, ("does", "do"), " not matter")
+    return [f"; {', '.join(each)} {verbs[len(each) > 1]}{rest}" for each, verbs, rest in said if each]
 
 
 def units(answer: Identification, name: str) -> str:
@@ -214,7 +211,7 @@ def unit(answer: Identification | ManyIdentified) -> str:
     own |= {"time": roles.clock, "dt": roles.dt} if timed else {}
     own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
-    return f"[[unit]]\n{text}alarm = {{ every = {json.dumps('1 week' if timed else 10_000)} }}\n"
+    return f"[[unit]]\n{text}alarm = {WEEKLY if timed else '{}'}\n"
 
 
 def effect(answer: Identification, one: Effect) -> str:
@@ -234,7 +231,8 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     said = [f"{head}: {'; '.join(each)}." for head, each in
             (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
-    short = [line if len(line) < WIDTH else SPLIT.sub(r" \\\n   \1", line) for line in commands(answer)]
+    short = [line if len(line) < WIDTH else f"{line[:at]} \\\n  {line[at:]}" for line in commands(answer)
+             for at in [max(line.find(" --model"), line.find(" --quiet"))]]  # fmt: skip
     return [
         (style, f" {line}") for style, line in (*found, *(("", one) for one in said), *(("dim", one) for one in short))
     ]
@@ -304,9 +302,11 @@ def body(answer: Identification) -> list[str]:
     leads = (f"{name} {one[0]:.1f} +- {one[1]:.1f}" for name, one in
              (("tracked parameters", cause.tracked), ("a curve", cause.curve), ("both", cause.joint)))  # fmt: skip
     if answer.kind in KINDS[1:3] and answer.model.input_names:
-        run, own = answer.curve, {"y": answer.roles.output, "u": [*answer.model.input_names]}
-        own |= {"data": answer.source[0] if len(answer.source) == 1 else [*answer.source], "time": answer.roles.clock}
-        given = "".join(f", {name}={one!r}" for name, one in (own | {"dt": answer.roles.dt}).items() if one)
+        run, roles, source = answer.curve, answer.roles, [*answer.source]
+        own = dict[str, Any](y=roles.output, u=[*answer.model.input_names])
+        own |= {"data": source[0] if len(source) == 1 else source}
+        own |= {"time": roles.clock, "dt": roles.dt} if roles.clock else {}
+        given = "".join(f", {name}={one!r}" for name, one in own.items())
         error = root_mean_square((run.y - run.prediction)[settled(run)])
         curve = f"<p>That curve, fitted; its error one step ahead is {error:.4g}:</p>"
         curve += f"<pre>{escape(f'track({run.model!r}, RLS(1.0){given})')}</pre>"
@@ -410,15 +410,14 @@ class Identification(Printed):
         fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
         return fitted
 
-    def live(self, every: float = 10_000.0) -> Live:
+    def live(self, **settings: Any) -> Live:
         """The stream that continues the record, with an alarm armed: what came after the last change is its reference.
 
-        ``every``: samples in which one false alarm may begin. ValueError where too few samples came after the change.
+        ``settings`` are those of `Track.detect`. ValueError where too few samples came after the change.
         """
-        run = self.track
-        armed = run.detect(every=every, reference=(max((move.end for move in self.moves), default=0), len(run)))
+        run, since = self.track, max((move.end for move in self.moves), default=0)
         stream = Live(run.model, run.tracker, self.roles.dt if self.roles.clock else None, warm_start=run)
-        stream.detect(armed.rule)
+        stream.detect(run.detect(reference=(since, len(run)), **settings).rule)
         return stream
 
     headline = property(conclusion)

@@ -59,7 +59,7 @@ class Structure:
     instead: tuple[tuple[int, tuple[int, ...]], ...] = ()
     log: tuple[float, float] = (0.0, 0.0)
     forecast: Structure | None = None
-    narrowed: str = ""
+    narrowed: tuple[str, ...] = ()
 
     @property
     def shape(self) -> Shape:
@@ -178,11 +178,13 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     found = [j for j, _, _ in other[1] if j not in used]
     if found and all(_beats_copies(y, squares, other, j, rng) for j in found):
         pool, shape, U = even, other, squares
-    narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
+    narrowed += ("the budget of time ended the search",) if monotonic() > end else ()
     return _told(pool, shape, doubtful, _of_log(pool, shape, y, U, first), narrowed)
 
 
-def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float, float], narrowed: str) -> Structure:
+def _told(
+    pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float, float], narrowed: tuple[str, ...]
+) -> Structure:
     """A structure with its rivals."""
     own, (na, inputs) = pool.scores.terms(pool.columns(shape)), shape
     base, delays, instead = float(own.sum()), {}, []
@@ -194,12 +196,11 @@ def _told(pool: Pool, shape: Shape, doubtful: tuple[int, ...], log: tuple[float,
                     break
                 ends[side] += step
         delays[j] = ends[0], ends[1]
-        others = {(i,): one for i, one in pool.best_delays((na, rest)).items() if i != j}
+        others, with_it = {i: one for i, one in pool.best_delays((na, rest)).items() if i != j}, tuple[int, ...]()
         if others and base - max(others.values())[0] >= TIED:  # two others, as of a sum
-            (i,), (_, k) = max(others.items(), key=lambda one: one[1])
-            more = pool.best_delays((na, (*rest, (i, 1, k))))
-            others = {(i, h): one for h, one in more.items() if h != j}
-        instead += [(j, of) for of, (score, _) in others.items() if base - score < TIED]
+            i, (_, k) = max(others.items(), key=lambda one: one[1])
+            others, with_it = pool.best_delays((na, (*rest, (i, 1, k)))), (i,)
+        instead += [(j, (*with_it, i)) for i, (score, _) in others.items() if i != j and base - score < TIED]
     rivals = sorted((one for one in pool.shapes if one != shape), key=pool.value, reverse=True)
     second = tuple((one, *lead(own, pool.scores.terms(pool.columns(one)))) for one in rivals[:3])
     lags = {j: (nb, nk) for j, nb, nk in inputs}
@@ -217,13 +218,13 @@ def _of_log(pool: Pool, shape: Shape, y: Array, U: Array, first: int) -> tuple[f
     return lead(other.terms(S) - own.count * np.log(other.size / own.size) - slope, own.terms(S))
 
 
-def _affordable(y: Array, U: Array, M: int) -> tuple[int, str]:
+def _affordable(y: Array, U: Array, M: int) -> tuple[int, tuple[str, ...]]:
     """The longest lag that memory and record allow, and what is said of it: half of the rows must have all lags."""
     t, known = np.arange(len(y)), np.isfinite(np.column_stack([filled(x) for x in (y, *U.T)])).all(axis=1)
     run = (t - np.maximum.accumulate(np.where(known, -1, t)))[np.isfinite(y)]  # known samples in a row
     half = int(np.median(run[run > 1])) - 1 if (run > 1).any() else 1
     most = max(1, min(M, len(y) // 10, COLUMNS // max(U.shape[1], 1) - 1, half))
-    return most, f"lags of inputs up to {most} instead of {M}" if most < M else ""
+    return most, (f"lags of inputs up to {most} instead of {M}",) if most < M else ()
 
 
 def _beats_copies(y: Array, U: Array, shape: Shape, j: int, rng: np.random.Generator) -> bool:

@@ -20,7 +20,8 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.fit import MOST, estimated, noise_of, order_of, regressed, split, white_rows
 from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price
-from driftfit.judge.changes.scan import SINGULAR, add, searched
+from driftfit.judge.changes.recursion import searched
+from driftfit.judge.changes.scan import SINGULAR, add
 from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
 
 LEVEL = 0.95

@@ -20,7 +20,8 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.changes.scan import SINGULAR, problem_of, searched
+from driftfit.judge.changes.recursion import searched
+from driftfit.judge.changes.scan import SINGULAR, problem_of
 from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible, scale_of
 from driftfit.judge.statistics.whiteness import loudest, ranks
 

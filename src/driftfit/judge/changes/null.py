@@ -23,8 +23,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.changes.fit import HELD, Noise, coefficients, noise, order_of, white_rows
-from driftfit.judge.changes.recursion import Recursion, Results, draw
-from driftfit.judge.changes.scan import Found, Problem, Work, problem_of, searched
+from driftfit.judge.changes.recursion import Recursion, Results, draw, searched
+from driftfit.judge.changes.scan import Found, Problem, Work, problem_of
 from driftfit.judge.statistics.robust import SMALL, Basis, Fit, invertible
 
 DRAWS = (19, 39, 79, 199)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from driftfit.engine.kernel import Array, Driver, shared, sized
 from driftfit.judge.changes.scan import Found, Problem, Work, search, settle
 
@@ -79,18 +81,22 @@ class Results(NamedTuple):
 def draw(
     way: Recursion, signs: Array, problem: Problem, whole: int, work: Work, found: Found, results: Results
 ) -> None:
-    """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``."""
-    N, n = way.phi.shape
-    for d in range(signs.shape[0]):
-        simulate(way, problem.lags, signs[d], work.v, work.phi, work.y)
-        turned(n, work.phi, way.basis, work.X)
-        for t in range(N):
-            work.y[t] = work.v[t]  # without what constants explain, which may be far larger
+    """Results of all draws of signs (R, N); only constants and their autoregression unless ``whole``.
+
+    Without draws, the record in ``work`` is searched: by the same call, because it takes seconds to compile.
+    """
+    (N, n), R = work.X.shape, signs.shape[0]
+    for d in range(max(R, 1)):
+        if R > 0:
+            simulate(way, problem.lags, signs[d], work.v, work.phi, work.y)
+            turned(n, work.phi, way.basis, work.X)
+            for t in range(N):
+                work.y[t] = work.v[t]  # without what constants explain, which may be far larger
         if whole > 0:
             search(work.X, work.y, problem, work, found)
-            for count in range(3):
+            for count in range(3 if R > 0 else 0):
                 results.rss[d, count] = found.rss[count]
-            for i in range(found.L.shape[0]):
+            for i in range(found.L.shape[0] if R > 0 else 0):
                 results.L[d, i] = found.L[i]
             continue
         for i in range(results.ar.shape[1]):
@@ -98,6 +104,16 @@ def draw(
         settle(work.X, work.y, problem, results.ar[d], work)
         for j in range(n):
             results.theta[d, j] = work.theta[j]
+
+
+def searched(X: Array, y: Array, problem: Problem) -> tuple[Found, Work]:
+    """What `search` finds in one record."""
+    N, n = X.shape
+    rows, row, whole = np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0), np.int64)
+    found, work = Found.of(n, problem), Work.of(N, n, problem)._replace(X=X, y=y)
+    none = Recursion(rows, rows, whole.ravel(), whole, rows, row, row, row, row), Results(rows, rows, rows, rows)
+    draw(none[0], rows, problem, 1, work, found, none[1])
+    return found, work
 
 
 @Driver

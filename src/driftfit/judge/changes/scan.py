@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver, shared, sized
+from driftfit.engine.kernel import Array, shared, sized
 from driftfit.judge.statistics.robust import SMALL, eliminate, solved
 
 SINGULAR = 1e-9
@@ -393,16 +393,3 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
             whiten(X.shape[1], X, y, problem.g, problem.lags, work.next[count], work.Z)
             least = prepare(X, problem, count, work)
             keep(problem, count, work, work.next[count], least, found)
-
-
-@Driver
-def _searched(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
-    search(X, y, problem, work, found)
-
-
-def searched(X: Array, y: Array, problem: Problem) -> tuple[Found, Work]:
-    """What `search` finds in one record."""
-    N, n = X.shape
-    found, work = Found.of(n, problem), Work.of(N, n, problem)
-    _searched(X, y, problem, work, found)
-    return found, work

@@ -154,7 +154,9 @@ def sole(Q: Array) -> Array:
 def _fitted(Q: Array, y: Array, theta: Array, residual: Array) -> float:
     """Fill in theta (n,) and the residuals (N,) of y (N,) on Q (N, n); returns their scale."""
     (N, n), scale, step, M = Q.shape, 0.0, np.empty(Q.shape[1]), np.empty((Q.shape[1] + 1, Q.shape[1] + 1))
-    level, residual[:] = ROUNDING * np.sqrt(np.mean(y * y)), y
+    level = ROUNDING * np.sqrt(np.mean(y * y))
+    for t in range(N):  # without slices, whose errors take Numba two seconds to compile
+        residual[t] = y[t]
     for round in range(ROUNDS):
         M[:] = 0.0
         for t in range(N):
@@ -174,7 +176,8 @@ def _fitted(Q: Array, y: Array, theta: Array, residual: Array) -> float:
                 residual[t] -= Q[t, i] * step[i]
                 turn += Q[t, i] * (step[i] - theta[i])
             moved = max(moved, abs(turn))
-        theta[:] = step
+        for i in range(n):
+            theta[i] = step[i]
         before, scale = scale, scale_of(residual)
         if ((round > 0 and not scale > level) or round == ROUNDS - 1) and scale < SHRINKING * before:
             scale = 0.0

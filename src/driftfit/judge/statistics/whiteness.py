@@ -68,7 +68,6 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))
 
 
-@Driver
 def ranks(phi: Array) -> Array:
     """Ranks (N, n) of the sizes of every regressor of phi (N, n), equal ones for equal sizes, about their mean."""
     ranked = np.empty(phi.shape)
