@@ -30,14 +30,15 @@ def idle() -> None:
     print("An input that is constant: response to x, 2 after a jump, at the end")
     print(f"  {'second column':16}{'AdaptiveKalman':>22}{'Bank()':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
     for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
-        cells = []
-        for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                run = track(Regression(2), tracker, y, np.column_stack([x, second]))
-            both = name == "is x again"
-            cells.append(f"{run.theta[-1].sum() if both else run.theta[-1, 0]:.3f} (std {run.std[-1, 0]:.3f})")
-        print(f"  {name:16}" + "".join(f"{cell:>22}" for cell in cells))
+        for gate in (None, False):
+            cells = []
+            for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    run = track(Regression(2), tracker, y, np.column_stack([x, second]), gate=gate)
+                both = name == "is x again"
+                cells.append(f"{run.theta[-1].sum() if both else run.theta[-1, 0]:.3f} (std {run.std[-1, 0]:.3f})")
+            print(f"  {name if gate is None else '  no gate':16}" + "".join(f"{cell:>22}" for cell in cells))
 
 
 def codes() -> None:
@@ -47,9 +48,10 @@ def codes() -> None:
     for t in range(1, T):
         y[t] = 0.7 * y[t - 1] + 2.0 * u[t - 1] + 0.1 * rng.normal()
     print("\nFault codes: largest distance from [0.7, 2], 20 and 500 samples after the last of them")
-    columns = [("AdaptiveKalman", AdaptiveKalman(), None), ("RLS(0.98), gate", FORGET, True)]
-    columns += [("no gate", FORGET, False), ("Kalman, gate", WALK, True), ("no gate", WALK, False)]
-    print(f"  {'codes':22}" + "".join(f"{name:>18}" for name, _, _ in columns))
+    columns = [("AdaptiveKalman", AdaptiveKalman(), None), ("no gate", AdaptiveKalman(), False)]
+    columns += [("RLS(0.98), gate", FORGET, True), ("no gate", FORGET, False)]
+    columns += [("Kalman, gate", WALK, True), ("no gate", WALK, False)]
+    print(f"  {'codes':22}" + "".join(f"{name:>16}" for name, _, _ in columns))
     for code, count, where, begin in (
         (9999.0, 1, "y", 100), (9999.0, 5, "y", 100), (-999.0, 1, "y", 100), (9999.0, 1, "u", 100),
         (9999.0, 1, "y", 0), (9999.0, 20, "y", 0), (-999.0, 1, "y", 4), (9999.0, 1, "u", 4),
@@ -62,7 +64,7 @@ def codes() -> None:
                 warnings.simplefilter("ignore")  # a run without a gate names the codes
                 away = np.abs(track(ARX(1, 1), tracker, **record, gate=gate).theta - [0.7, 2.0]).max(axis=1)
             cells.append(f"{away[begin + count + 19]:.3f}, {away[begin + count + 499]:.3f}")
-        print(f"  {f'{code:g}, {count} in {where}, from {begin}':22}" + "".join(f"{cell:>18}" for cell in cells))
+        print(f"  {f'{code:g}, {count} in {where}, from {begin}':22}" + "".join(f"{cell:>16}" for cell in cells))
 
 
 def coarse() -> None:
@@ -72,16 +74,17 @@ def coarse() -> None:
     u = np.column_stack([x, np.ones(T)])
     y = np.round(u @ [2.0, 32.0] + 0.05 * rng.normal(size=T))
     print("\nWhole numbers, inputs that change every 20 samples (1 / sqrt 12 is 0.289)")
-    print(f"  {'':20}{'innovation std':>16}{'y in band':>12}{'theta in band':>15}{'log-likelihood':>16}")
+    print(f"  {'':24}{'innovation std':>16}{'y in band':>12}{'theta in band':>15}{'log-likelihood':>16}")
     for name, tracker, gate in (
-        ("AdaptiveKalman", AdaptiveKalman(), None), ("Bank()", Bank(), None), ("RLS(0.98), gate", FORGET, True),
-        ("RLS(0.98), no gate", FORGET, False), ("Kalman", WALK, False),
+        ("AdaptiveKalman", AdaptiveKalman(), None), ("AdaptiveKalman, no gate", AdaptiveKalman(), False),
+        ("Bank()", Bank(), None), ("Bank(), no gate", Bank(), False), ("RLS(0.98), gate", FORGET, True),
+        ("RLS(0.98), no gate", FORGET, False), ("Kalman, gate", WALK, True), ("Kalman, no gate", WALK, False),
     ):  # fmt: skip
         run, late = track(Regression(2), tracker, y, u, gate=gate), slice(200, None)
         inside = np.abs(run.innovation[late]) < 1.96 * run.innovation_std[late]
         covered = np.abs(run.theta[late] - [2.0, 32.0]) < 1.96 * run.std[late]
         print(
-            f"  {name:20}{np.median(run.innovation_std[late]):>16.3f}{inside.mean():>12.2f}{covered.mean():>15.2f}"
+            f"  {name:24}{np.median(run.innovation_std[late]):>16.3f}{inside.mean():>12.2f}{covered.mean():>15.2f}"
             f"{run.loglik:>16.0f}"
         )
 
@@ -89,13 +92,16 @@ def coarse() -> None:
 def arcs() -> None:
     """i = g u, with g alternating between 0.02 and 4."""
     print("\nA conductance that switches between 0.02 and 4: rms error of g u")
-    names = ("AdaptiveKalman", "RLS(0.998)", "RLS(0.98)", "Kalman")
+    names = ("AdaptiveKalman", "no gate", "RLS(0.998)", "RLS(0.98)", "Kalman")
     print(f"  {'half period':18}" + "".join(f"{name:>16}" for name in names))
     for half in (10, 25, 50, 100):
         arc = switching(half=half)
         u = np.column_stack([arc.u, np.random.default_rng(3).normal(size=len(arc.u))])
-        trackers: list[Tracker] = [AdaptiveKalman(), RLS(0.998), FORGET, WALK]
-        runs: list[Track] = [track(Regression(2), tracker, arc.i, u) for tracker in trackers]
+        trackers: list[Tracker] = [AdaptiveKalman(), AdaptiveKalman(), RLS(0.998), FORGET, WALK]
+        gates = (None, False, None, None, None)
+        runs: list[Track] = [
+            track(Regression(2), one, arc.i, u, gate=gate) for one, gate in zip(trackers, gates, strict=True)
+        ]
         cells = (rms(((run.theta[:, 0] - arc.g) * arc.u)[200:]) for run in runs)
         print(f"  {f'{half} samples':18}" + "".join(f"{cell:>16.2f}" for cell in cells))
 
@@ -108,30 +114,33 @@ def ignition() -> None:
         g[k] = 4.0 if abs(u[k]) > 0.7 or (g[k - 1] > 1.0 and u[k] * u[k - 1] > 0.0) else 0.02
     i, begins = g * u + 0.05 * rng.normal(size=T), np.append(False, np.diff(g) > 0.0)
     print("\nAn arc that ignites at 0.7 of the peak voltage: rms error of the prediction of i, one step ahead")
-    print(f"  {'':18}{'all samples':>16}{'at ignition':>16}{'elsewhere':>16}")
-    named = (("AdaptiveKalman", AdaptiveKalman()), ("RLS(0.998)", RLS(0.998)), ("RLS(0.98)", FORGET), ("Kalman", WALK))
-    for name, tracker in named:
-        e = track(Regression(1), tracker, i, u[:, None]).innovation[200:]
+    print(f"  {'':24}{'all samples':>16}{'at ignition':>16}{'elsewhere':>16}")
+    named: list[tuple[str, Tracker, bool | None]] = [("AdaptiveKalman", AdaptiveKalman(), None)]
+    named += [("AdaptiveKalman, no gate", AdaptiveKalman(), False), ("RLS(0.998)", RLS(0.998), None)]
+    for name, tracker, gate in [*named, ("RLS(0.98)", FORGET, None), ("Kalman", WALK, None)]:
+        e = track(Regression(1), tracker, i, u[:, None], gate=gate).innovation[200:]
         cells = (rms(e), rms(e[begins[200:]]), rms(e[~begins[200:]]))
-        print(f"  {name:18}" + "".join(f"{c:>16.2f}" for c in cells))
+        print(f"  {name:24}" + "".join(f"{c:>16.2f}" for c in cells))
 
 
 def smoothing() -> None:
     """Both parameters are random walks, in noise of standard deviation 0.3; 20 records of 500 samples."""
     print("\nParameters that walk, 20 records: rms error, and share of the truth in 95 % bands")
     print(f"  {'step':18}{'followed':>16}{'smoothed':>16}")
-    for step in (0.01, 0.03, 0.1):
+    for step, gate in [(step, gate) for step in (0.01, 0.03, 0.1) for gate in (None, False)]:
         found: list[list[float]] = []
         for seed in range(20):
             rng = np.random.default_rng(seed)
             u, theta = rng.normal(size=(500, 2)), 1.0 + np.cumsum(step * rng.normal(size=(500, 2)), axis=0)
-            run = track(Regression(2), AdaptiveKalman(), (u * theta).sum(axis=1) + 0.3 * rng.normal(size=500), u)
+            y = (u * theta).sum(axis=1) + 0.3 * rng.normal(size=500)
+            run = track(Regression(2), AdaptiveKalman(), y, u, gate=gate)
             path, late = run.smooth(), slice(100, None)
             away, back = (run.theta - theta)[late], (path.theta - theta)[late]
             inside, covered = np.abs(away) < 1.96 * run.std[late], np.abs(back) < 1.96 * path.std[late]
             found.append([rms(away), float(inside.mean()), rms(back), float(covered.mean())])
         a, b, c, d = np.mean(found, axis=0)
-        print(f"  {f'{step:g} a sample':18}{f'{a:.3f}, {b:.2f}':>16}{f'{c:.3f}, {d:.2f}':>16}")
+        name = f"{step:g} a sample" if gate is None else "  no gate"
+        print(f"  {name:18}{f'{a:.3f}, {b:.2f}':>16}{f'{c:.3f}, {d:.2f}':>16}")
 
 
 def main() -> None:
