@@ -322,9 +322,10 @@ def noise_variance(data: Data, path: Path) -> float:
     return path.cost / free
 
 
-def plot_smoothed(run: Track, theta: Array, low: Array, high: Array, ax: Any = None) -> Figure:
-    """Parameters with bands, smoothed over filtered."""
-    n = len(run.names)
+def plot_smoothed(run: Track, theta: Array, low: Array, high: Array, ax: Any = None, names: Any = None) -> Figure:
+    """Parameters with bands, smoothed over filtered unless they have other ``names``."""
+    names = run.names if names is None else names
+    n = len(names)
     columns = 1 if n <= 4 else 2 if n <= 12 else 4
     rows = -(-n // columns)
     figure, axes = panels(ax, (9.0, 1.7 * rows + 0.8), n, columns, sharex=True)
@@ -332,10 +333,11 @@ def plot_smoothed(run: Track, theta: Array, low: Array, high: Array, ax: Any = N
         known = np.isfinite(low[:, i]) & np.isfinite(high[:, i])
         axis.fill_between(run.time, low[:, i], high[:, i], where=known, color=BLUE, alpha=0.2, lw=0)
         axis.plot(run.time, theta[:, i], color=BLUE, lw=1.4, label="smoothed")
-        view = axis.get_ylim()
-        axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
-        axis.set_ylim(*view)
-        axis.set_ylabel(run.names[i])
+        if names == run.names:
+            view = axis.get_ylim()
+            axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
+            axis.set_ylim(*view)
+        axis.set_ylabel(names[i])
         axis.grid(alpha=0.25, lw=0.5)
     axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
     axes[-1].set_xlabel("time" if run.timed else "sample")

@@ -75,7 +75,7 @@ def blocks_of(
     one_of("blocks", "method", method, METHODS)
     theta = run.theta if smoothed is None else smoothed[0]
     if run.names == model.structure.minimal_names:
-        found = _of_minimal(run, model)
+        found = of_minimal(model, run.theta, run.var, run.written("P") if run.keeps_cov else None)
     elif method == "gls":
         found = _by_least_squares(run, model, theta, covariances(run) if smoothed is None else [(0, smoothed[1]())])
     else:
@@ -126,19 +126,17 @@ def _warn(found: Blocks, run: Track, theta: Array, input: str | None) -> None:
             )
 
 
-def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
-    """The blocks of a tracker of the minimal parameters."""
+def of_minimal(model: HammersteinWiener, xi: Array, var: Array, cov: Array | None) -> Blocks:
+    """The blocks of minimal parameters xi (T, n_x) with their variances, and covariances if they are known."""
     structure = model.structure
     at = structure.na + sum(structure.nb)
     leads = at + structure.leads - np.arange(model.m)
     fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 are inserted
-    var = np.insert(run.var, fixed, 0.0, axis=1)
-    cov = None
-    if run.keeps_cov:
-        cov = np.insert(np.insert(run.written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
-    a, b, c, d = structure.groups(run.theta)
-    exact, std = np.zeros((len(run), 2)), deviations(model, var)
-    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(model, run.theta), cov, gauged=("c1", "d1"))
+    if cov is not None:
+        cov = np.insert(np.insert(cov, fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    a, b, c, d = structure.groups(xi)
+    exact, std = np.zeros((len(xi), 2)), deviations(model, np.insert(var, fixed, 0.0, axis=1))
+    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(model, xi), cov, gauged=("c1", "d1"))
 
 
 def _by_least_squares(run: Track, model: HammersteinWiener, path: Array, pieces: Iterable[tuple[int, Array]]) -> Blocks:

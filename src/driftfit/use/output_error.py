@@ -1,0 +1,386 @@
+"""The most probable path of a Hammerstein-Wiener system, whose output is simulated and then measured.
+
+    v_t = sum_k c_kt f_k(u_t)                                                   input curve, c_1 = 1
+    w_t = -sum_i a_it w_{t-i} + sum_j b_jt v_{t-nk-j+1} - l_t + omega_t         omega_t ~ N(0, q_w)
+    y_t = G(w_t; d_t) + v_t                                                     v_t ~ N(0, r / weight_t)
+    x_t = (a, b, c_2 .., d_2 .., l) = x_{t-1} + eta_t,                          eta_tj ~ N(0, q_j drift_t dt_t)
+
+G is the inverse of the model's output curve, sum_k d_k g_k(y) = w, or with ``forward`` a curve y = sum_k d_k g_k(w),
+which need not be one-to-one; d_1 = 1. y is never a regressor, so its noise does not bias: r = 0 would be the equation
+error of stage one, q_w = 0 the output error of identification. Knots of piecewise linear curves and centres of
+sigmoids may be estimated as constants; thresholds are coefficients anyway.
+
+The path of x, omega and the w before the record minimises the sum of all squares over their variances. Gauss-Newton
+steps about a path are smoothed paths of the linearised problem (`driftfit.smooth.solvers.simulated`); w is simulated
+again after each, and a step is halved until the sum falls. The log-likelihood is that of the linearised problem at the
+minimum, which is Laplace's approximation. r, q_w and each q_j are multiplied by sqrt(sum moved / sum expected), which
+cannot lower the likelihood of the linearised problem; a power of this factor is taken as long as it pays. c of a past
+input is that of its own time, and its step is taken to be that of the present.
+
+Sources: Bell (1994) for the iterated smoother; Tierney and Kadane (1986); Zhou, Hu, Qiao and Lange (2019) for the
+update of variances; Salakhutdinov and Roweis (2003) for its power. The path begins as the median of the coefficients
+of a run; the prior of x_0 is as wide as its influence on y is small. Cost: some 100 passes of O(T (na + n)^2).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import cached_property
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import numbers, vector, whole
+from driftfit.models.hammerstein_wiener.basis import Basis, PiecewiseLinear, Sigmoid
+from driftfit.models.hammerstein_wiener.blocks import Blocks
+from driftfit.models.hammerstein_wiener.forward import Inverse
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.output_error import SLOPE_SHARE
+from driftfit.run.result import Track, burn_in
+from driftfit.show.text import Printed, table_of
+from driftfit.smooth.smoothed import plot_smoothed
+from driftfit.smooth.solvers import simulated
+from driftfit.smooth.solvers.simulated import Problem, Solution, recursion, solve
+from driftfit.use.blocks import blocks_of, of_minimal, reflected
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+WEAK = 10.0
+"""Standard deviation of x_0, in those by which each parameter alone would explain the error of constant ones."""
+LEAST = 1e-8
+"""Least variance of a drift or of noise, in those at the start."""
+STEPS, HALVINGS = 30, 12
+STILL = 1e-6
+"""Gauss-Newton steps end where the sum of squares falls by less; one unit is half of one in the log-likelihood."""
+RISE = 0.02
+"""Variances stay where the log-likelihood rises by less."""
+
+
+class Path(NamedTuple):
+    """x (T, n), omega (T,), and the w before the record (na,), the last one first."""
+
+    x: Array
+    omega: Array
+    w: Array
+
+    def moved(self, other: Path, share: float) -> Path:
+        return Path(*(one + share * (two - one) for one, two in zip(self, other, strict=True)))
+
+
+class Simulation(NamedTuple):
+    """w and y (T,), and the derivatives of w by its lags and x, of y by w and x, (T, na + n)."""
+
+    w: Array
+    y: Array
+    of_w: Array
+    of_e: Array
+
+
+KNOTS = {PiecewiseLinear: "knots", Sigmoid: "centres"}
+"""The setting of a basis with its knots."""
+
+
+@dataclass(frozen=True)
+class System:
+    """The equations over a record: the model, whether its output curve is ``forward``, and whether knots are free."""
+
+    model: HammersteinWiener
+    u: Array
+    span: tuple[float, float]
+    forward: bool = False
+    knots: bool = False
+
+    @cached_property
+    def free(self) -> list[tuple[float, ...]]:
+        """Free knots at the start of the curve of each input, and of the output."""
+        curves = (*self.model.bases, self.model.out)
+        return [getattr(one, KNOTS[type(one)]) if self.knots and type(one) in KNOTS else () for one in curves]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        tags = (*self.model.structure.tags, "[y]")
+        knots = [f"knot{k + 1}{tag}" for tag, own in zip(tags, self.free, strict=True) for k in range(len(own))]
+        return (*self.model.called(self.model.structure.minimal_names), *self.model.called(knots))
+
+    def of_curves(self, x: Array) -> list[Array]:
+        """The knots among one x (n,), of each curve."""
+        return np.split(x[self.model.structure.n_x :], np.cumsum([len(own) for own in self.free])[:-1])
+
+    def at(self, x: Array) -> HammersteinWiener:
+        """The model with the knots of one x (n,)."""
+        bases = [replace(one, **{KNOTS[type(one)]: tuple(own.tolist())}) if len(own) else one
+                 for one, own in zip((*self.model.bases, self.model.out), self.of_curves(x), strict=True)]  # fmt: skip
+        return replace(self.model, input=bases[:-1], output=bases[-1]) if self.knots else self.model
+
+    @property
+    def missing(self) -> Array:
+        """(T,) bool: where a function of an input is not known, so that w is lost."""
+        lost, s = np.zeros(len(self.u), bool), self.model.structure
+        for u, basis, nk, nb in zip(self.u.T, self.model.bases, self.model.delays, s.nb, strict=True):
+            unknown = ~np.isfinite(basis.value(u)).all(axis=1)
+            for j in range(nb):
+                lost |= late(unknown, nk + j)
+        return lost
+
+    def __call__(self, path: Path) -> Simulation:
+        model, (T, n) = self.at(path.x[0]), path.x.shape
+        s, x = model.structure, path.x
+        na, spans, nw, at = s.na, s.spans(False), max(s.na, 1), s.n_x
+        a, _, c, d = s.groups(x[:, :at])
+        drive, of_w, of_e = path.omega.copy(), np.zeros((T, nw + n)), np.zeros((T, nw + n))
+        for i, (own, nk) in enumerate(zip(s.of_inputs(c, s.n_in), model.delays, strict=True)):
+            u, basis, more = self.u[:, i], model.bases[i], len(self.free[i])
+            f = np.nan_to_num(np.hstack([basis.for_coefficients(u, own), by_knots(basis, u, own, more)]))
+            v = np.sum(f[:, : basis.n] * own, axis=1)
+            entries = nw + np.concatenate([spans.c[i], np.arange(at, at + more)])
+            for j, b in enumerate(spans.b[i]):
+                of_w[:, nw + b] = late(v, nk + j)
+                of_w[:, entries] += x[:, b, None] * late(f[:, 1:], nk + j)
+                drive += x[:, b] * of_w[:, nw + b]
+            at += more
+        of_w[:, nw + spans.rest] = -1.0
+        drive -= np.sum(x[:, spans.rest], axis=1)
+        w = np.concatenate([path.w[::-1], np.empty(T)])
+        recursion(-a, drive, w)
+        of_w[:, :na] = -a
+        for k in range(na):
+            of_w[:, nw + k] = -w[na - 1 - k : na - 1 - k + T]
+        w = w[na:]
+        point = w if self.forward or model.linear else Inverse(model, d, self.span)(w)
+        slope, g = np.sum(model.out.derivative(point) * d, axis=1), model.out.value(point)
+        y, scale = np.sum(g * d, axis=1), np.ones((T, 1))
+        if not self.forward:
+            y, scale = point, -1.0 / np.maximum(slope, SLOPE_SHARE * model.out.steepness)[:, None]
+        of_e[:, 0] = slope if self.forward else -scale[:, 0]
+        of_e[:, nw + spans.d] = scale * g[:, 1:]
+        of_e[:, nw + at :] = scale * by_knots(model.out, point, d, n - at)
+        return Simulation(w, y, of_w, of_e)
+
+
+def by_knots(basis: Basis, x: Array, c: Array, count: int) -> Array:
+    """The derivatives of a curve by its knots (T, count), its last functions being h_k(x - knot_k) - h_k(-knot_k)."""
+    last = slice(basis.n - count, basis.n)
+    return np.asarray(c[:, last] * (basis.derivative(np.zeros(1)) - basis.derivative(x))[:, last])
+
+
+def late(x: Array, k: int) -> Array:
+    """x (T, ..) delayed by k samples, 0 before."""
+    return np.concatenate([np.zeros_like(x[: min(k, len(x))]), x[: max(len(x) - k, 0)]])
+
+
+class Fit:
+    """A record with its variances (2 + n,), r, q_w and q, and the most probable path."""
+
+    def __init__(self, system: System, y: Array, factors: Array, start: Path) -> None:
+        """``factors`` (2, T) are those of the noise and of drift."""
+        self.system, self.y, self.path = system, y, start
+        self.signals = np.column_stack([np.zeros(len(y)), *factors, np.zeros((len(y), 2))])
+        self.used = np.isfinite(factors[0])
+        sim = system(start)
+        nw, n, T = sim.of_w.shape[1] - start.x.shape[1], start.x.shape[1], len(y)
+        e = (y - sim.y)[self.used]
+        self.power = float(np.var(y[self.used])) or 1.0
+        r = max(float(np.mean(e**2)), LEAST * self.power)
+        effect = np.mean((sim.of_e[:, nw:] + sim.of_e[:, :1] * sim.of_w[:, nw:])[self.used] ** 2, axis=0)
+        effect[effect == 0.0] = self.power
+        size = float(np.mean(sim.w**2)) or 1.0
+        self.mean, self.var = start.x[0], np.concatenate([np.full(nw, size), WEAK**2 * r / effect])
+        self.variances = np.concatenate([[r, 1e-4 * size * r / self.power], r / (T * effect)])
+        self.variances[2 + system.model.structure.n_x :] = 0.0
+        self.signals[system.missing, simulated.LOST] = size
+        
+    def tried(self, path: Path) -> tuple[float, Simulation | None]:
+        """The sum of squares over their variances; inf where knots cross or w is unstable."""
+        if any(np.any(np.diff(own) <= 0.0) for own in self.system.of_curves(path.x[0])):
+            return np.inf, None
+        r, q_w, q = self.variances[0], self.variances[1], self.variances[2:]
+        with np.errstate(over="ignore", invalid="ignore"):
+            sim = self.system(path)
+            total = np.sum((self.y - sim.y)[self.used] ** 2 / self.signals[self.used, simulated.NOISE]) / r
+            for moves, var in (
+                (np.diff(path.x, axis=0), self.signals[1:, simulated.DRIFT, None] * q),
+                (path.omega, q_w + self.signals[:, simulated.LOST]), (path.x[0] - self.mean, self.var[-len(q) :]),
+                (path.w, self.var[: len(path.w)]),
+            ):  # fmt: skip
+                total += np.sum(np.divide(moves**2, var, out=np.zeros_like(moves), where=var > 0.0))
+        return (float(total) if np.isfinite(total) else np.inf), sim
+
+    def linearised(self, sim: Simulation, path: Path, cov: bool = False) -> Solution:
+        """The smoothed deviation from a path."""
+        signals = self.signals.copy()
+        signals[:, simulated.E], signals[:, simulated.OMEGA] = np.where(self.used, self.y - sim.y, 0.0), -path.omega
+        nw = len(self.var) - path.x.shape[1]
+        shift = -np.diff(path.x, axis=0, prepend=path.x[:1])
+        mean = np.concatenate([-path.w, np.zeros(nw - len(path.w)), self.mean - path.x[0]])
+        return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), self.variances, cov)
+
+    def minimise(self, path: Path) -> tuple[Path, Simulation, Solution]:
+        """Gauss-Newton steps from a path."""
+        cost, sim = self.tried(path)
+        for _ in range(STEPS):
+            assert sim is not None
+            found, before = self.linearised(sim, path), cost
+            nw = found.z.shape[1] - path.x.shape[1]
+            aim = Path(path.x + found.z[:, nw:], path.omega + found.omega, path.w + found.begin[: len(path.w)])
+            for k in range(HALVINGS):
+                trial = path.moved(aim, 0.5**k)
+                cost, other = self.tried(trial)
+                if cost < before:
+                    path, sim = trial, other
+                    break
+            if not cost < before - STILL:
+                break
+        assert sim is not None
+        return path, sim, self.linearised(sim, path)
+
+    def estimate(self, free: Array, rounds: int) -> Simulation:
+        """The variances that are ``free`` (2 + n,) bool, as many times as the likelihood rises."""
+        self.path, sim, found = self.minimise(self.path)
+        power, least = 0.5, LEAST * self.variances * free
+        for _ in range(rounds if free.any() else 0):
+            before = self.variances
+            with np.errstate(divide="ignore", invalid="ignore"):
+                factor = np.where(free & (found.expected > 0.0), found.moved / found.expected, 1.0) ** power
+            self.variances = np.maximum(before * factor, least)
+            path, *other = self.minimise(self.path)
+            rise = other[1].loglik - found.loglik
+            if rise > 0.0:
+                self.path, (sim, found), power = path, other, 1.5 * power
+            else:
+                self.variances = before
+            if rise < RISE and power == 0.5:
+                break
+            power = power if rise >= RISE else 0.5
+        return sim
+
+
+class OutputErrorPath(Printed):
+    """The most probable path of a Hammerstein-Wiener system, with bands.
+
+    Attributes
+    ----------
+    theta, std : (T, n)
+        The minimal parameters (a, b, c_2 .., d_2 .., l) and free knots, and their standard deviations.
+    cov : (T, n, n)
+        Their covariances, given r, q_w and q.
+    names : tuple of str
+    w, prediction : (T,)
+        Output of the linear block, and the simulated output.
+    r, q_w : float
+        Variances of the noise of y and of w.
+    q : (n,)
+        Variances of the drift per nominal sample.
+    loglik : float
+        Log-likelihood by Laplace's approximation.
+    """
+
+    def __init__(self, run: Track, fit: Fit, sim: Simulation) -> None:
+        self.run, self.system, self.names = run, fit.system, fit.system.names
+        found = fit.linearised(sim, fit.path, cov=True)
+        self.theta, self.cov, self.loglik = fit.path.x, found.cov, found.loglik
+        self.std = np.sqrt(np.maximum(np.einsum("tii->ti", found.cov), 0.0))
+        self.w, self.prediction = sim.w, sim.y
+        (self.r, self.q_w), self.q = fit.variances[:2].tolist(), fit.variances[2:]
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, n), of the normal distribution about the path."""
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        return self.theta - half, self.theta + half
+
+    def blocks(self, input: str | None = None, output: str = "d1", at: float = 0.0) -> Blocks:
+        """a, b, c and d with standard deviations, as `Track.blocks`, with free knots at their estimates.
+
+        d is of the curve y = sum_k d_k g_k(w) if that was estimated, whose gauge is "d1".
+        """
+        if self.system.forward and output != "d1":
+            raise ValueError(f'blocks: a curve of w has output="d1"; got {output!r}.')
+        n_x, model = self.system.model.structure.n_x, self.system.at(self.theta[0])
+        found = of_minimal(model, self.theta[:, :n_x], self.std[:, :n_x] ** 2, self.cov[:, :n_x, :n_x])
+        return found.gauge(input or "c1", output, at)
+
+    def __rich__(self) -> Table:
+        """Where each parameter begins and ends, its standard deviation there, and its drift."""
+        shown = table_of("Output error", "parameter", "first", "std", "last", "std", "drift a sample")
+        for j, name in enumerate(self.names):
+            ends = (f"{value[t, j]:.4g}" for t in (0, -1) for value in (self.theta, self.std))
+            shown.add_row(name, *ends, f"{self.q[j] ** 0.5:.2g}")
+        shown.caption = f"noise {self.r**0.5:.3g} of y, {self.q_w**0.5:.3g} of w; log-likelihood {self.loglik:.1f}"
+        return shown
+
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands; a matplotlib figure. ``ax`` as for `Track.plot`."""
+        return plot_smoothed(self.run, self.theta, *self.band(level), ax, self.names)
+
+
+def output_error(
+    run: Track,
+    forward: Basis | None = None,
+    *,
+    knots: bool = False,
+    q: Any = None,
+    r: float | None = None,
+    q_w: float | None = None,
+    rounds: int = 100,
+) -> OutputErrorPath:
+    """Estimate the path of a Hammerstein-Wiener system, and its noise and drift, by the likelihood of y.
+
+    Parameters
+    ----------
+    run : Track
+        A run of a `HammersteinWiener` model by any tracker, whose median coefficients after the first samples are
+        where the path begins; only its record, weights and intervals of time are used further.
+    forward : Basis or None
+        Functions g_k of an output curve y = sum_k d_k g_k(w), in the place of the model's; the run needs none.
+    knots : bool
+        Estimate the knots of `PiecewiseLinear` and the centres of `Sigmoid` curves, as constants.
+    q, r, q_w : numbers, q also (n_x,), or None
+        Variances of drift, of the noise of y and of that of w, where they are known.
+    rounds : int
+        Largest number of updates of the variances.
+
+    Raises
+    ------
+    ValueError
+        For another model, a run with a warm start or without samples, and knots where no curve has any.
+    """
+    given = run.model
+    if not isinstance(given, HammersteinWiener) or run.start is not None:
+        raise ValueError("output_error: needs the run of a HammersteinWiener model over a whole record.")
+    record, model = run.used_record, given if forward is None else replace(given, output=forward)
+    used = np.isfinite(record.y)
+    if not used.any():
+        raise ValueError("output_error: no sample of this run was used.")
+    span = (float(record.y[used].min()), float(record.y[used].max()))
+    system = System(model, record.u, span, forward is not None, knots)
+    if knots and len(system.names) == model.structure.n_x:
+        raise ValueError("output_error: knots= needs a curve that is PiecewiseLinear or a Sigmoid.")
+    noise, drift = np.where(used, record.noise, np.inf), record.known.drift * record.known.interval * np.ones(len(run))
+    drift[0] = 0.0
+    fit = Fit(system, record.y, np.stack([noise, drift]), _start(run, system))
+    fixed = np.concatenate([[np.nan if one is None else numbers("output_error", name, one, ndim=0, low=0.0)
+                             for name, one in (("r", r), ("q_w", q_w))],
+                            vector("output_error", "q", np.nan if q is None else q, model.structure.n_x)])  # fmt: skip
+    free = np.zeros(len(fit.variances), bool)
+    free[: len(fixed)] = np.isnan(fixed)
+    fit.variances[: len(fixed)] = np.where(np.isnan(fixed), fit.variances[: len(fixed)], fixed)
+    return OutputErrorPath(run, fit, fit.estimate(free, whole("output_error", "rounds", rounds, 0)))
+
+
+def _start(run: Track, system: System) -> Path:
+    """The median of the coefficients of a run, with its poles inside the unit circle."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = blocks_of(run)
+    s, T = system.model.structure, len(run)
+    xi = found.xi[min(burn_in(run.model.n), T // 2) :]
+    xi = np.median(xi[np.isfinite(xi).all(axis=1)], axis=0)
+    xi[: s.na] = reflected(xi[: s.na])
+    d = s.spans(False).d
+    if system.forward:
+        xi = np.insert(np.delete(xi, d[0] + np.arange(run.model.out.n - 1) if len(d) else []), [d[0]] * len(d), 0.0)
+    return Path(np.tile(np.concatenate([xi, *(np.array(own) for own in system.free)]), (T, 1)), np.zeros(T), np.zeros(s.na))
