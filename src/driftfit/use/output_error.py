@@ -54,6 +54,8 @@ WEAK = 10.0
 """Standard deviation of x_0, in those by which each parameter alone would explain the error of constant ones."""
 LEAST = 1e-8
 """Least variance of a drift or of noise, in those at the start."""
+QUIET = 1e-4
+"""Least noise of w at the start, as a share of that of y."""
 STEPS, HALVINGS = 30, 12
 STILL = 1e-6
 """Gauss-Newton steps end where the sum of squares falls by less; one unit is half of one in the log-likelihood."""
@@ -113,7 +115,7 @@ class System:
 
     def at(self, x: Array) -> HammersteinWiener:
         """The model with the knots of one x (n,)."""
-        bases = [replace(one, **{KNOTS[type(one)]: tuple(own.tolist())}) if len(own) else one
+        bases: list[Any] = [replace(one, **{KNOTS[type(one)]: tuple(own.tolist())}) if len(own) else one  # type: ignore[type-var]
                  for one, own in zip((*self.model.bases, self.model.out), self.of_curves(x), strict=True)]  # fmt: skip
         return replace(self.model, input=bases[:-1], output=bases[-1]) if self.knots else self.model
 
@@ -122,7 +124,7 @@ class System:
         """(T,) bool: where a function of an input is not known, so that w is lost."""
         lost, s = np.zeros(len(self.u), bool), self.model.structure
         for u, basis, nk, nb in zip(self.u.T, self.model.bases, self.model.delays, s.nb, strict=True):
-            unknown = ~np.isfinite(basis.value(u)).all(axis=1)
+            unknown = np.isnan(basis.value(u)).any(axis=1)
             for j in range(nb):
                 lost |= late(unknown, nk + j)
         return lost
@@ -168,7 +170,7 @@ def by_knots(basis: Basis, x: Array, c: Array, count: int) -> Array:
     return np.asarray(c[:, last] * (basis.derivative(np.zeros(1)) - basis.derivative(x))[:, last])
 
 
-def late(x: Array, k: int) -> Array:
+def late(x: Any, k: int) -> Array:
     """x (T, ..) delayed by k samples, 0 before."""
     return np.concatenate([np.zeros_like(x[: min(k, len(x))]), x[: max(len(x) - k, 0)]])
 
@@ -176,24 +178,27 @@ def late(x: Array, k: int) -> Array:
 class Fit:
     """A record with its variances (2 + n,), r, q_w and q, and the most probable path."""
 
-    def __init__(self, system: System, y: Array, factors: Array, start: Path) -> None:
-        """``factors`` (2, T) are those of the noise and of drift."""
-        self.system, self.y, self.path = system, y, start
-        self.signals = np.column_stack([np.zeros(len(y)), *factors, np.zeros((len(y), 2))])
-        self.used = np.isfinite(factors[0])
-        sim = system(start)
-        nw, n, T = sim.of_w.shape[1] - start.x.shape[1], start.x.shape[1], len(y)
-        e = (y - sim.y)[self.used]
-        self.power = float(np.var(y[self.used])) or 1.0
-        r = max(float(np.mean(e**2)), LEAST * self.power)
-        effect = np.mean((sim.of_e[:, nw:] + sim.of_e[:, :1] * sim.of_w[:, nw:])[self.used] ** 2, axis=0)
-        effect[effect == 0.0] = self.power
-        size = float(np.mean(sim.w**2)) or 1.0
-        self.mean, self.var = start.x[0], np.concatenate([np.full(nw, size), WEAK**2 * r / effect])
-        self.variances = np.concatenate([[r, 1e-4 * size * r / self.power], r / (T * effect)])
-        self.variances[2 + system.model.structure.n_x :] = 0.0
+    def __init__(self, system: System, record: tuple[Array, Array, Array], path: Path, fixed: Array) -> None:
+        """``record``: y and the factors of noise and of drift, (T,); ``fixed`` (2 + n,) variances, NaN if unknown."""
+        self.system, (self.y, noise, drift) = system, record
+        self.signals = np.column_stack([np.zeros(len(drift)), noise, drift, np.zeros((len(drift), 2))])
+        self.used = np.isfinite(noise)
+        sim = system(path)
+        T, n = path.x.shape
+        w, x = sim.of_w.shape[1] - n, slice(-n, None)
+        slope = float(np.mean(sim.of_e[:, 0] ** 2)) or 1.0
+        q_w, size = float(np.mean(path.omega**2)), float(np.mean(sim.w**2)) or 1.0
+        r = float(np.mean((self.y - sim.y)[self.used] ** 2)) + slope * q_w
+        r = max(r, LEAST * (float(np.var(self.y[self.used])) or 1.0))
+        effect = np.mean((sim.of_e[:, x] + sim.of_e[:, :1] * sim.of_w[:, x])[self.used] ** 2, axis=0)
+        effect[effect == 0.0] = slope * size
         self.signals[system.missing, simulated.LOST] = size
-        
+        self.mean, self.var = path.x[0], np.concatenate([np.full(w, size), WEAK**2 * r / effect])
+        guess = np.concatenate([[r, max(q_w, QUIET * r / slope)], r / (T * effect)])
+        self.free = np.isnan(fixed)
+        self.variances = np.where(self.free, guess, fixed)
+        self.path, self.sim, self.found = self.minimise(path)
+
     def tried(self, path: Path) -> tuple[float, Simulation | None]:
         """The sum of squares over their variances; inf where knots cross or w is unstable."""
         if any(np.any(np.diff(own) <= 0.0) for own in self.system.of_curves(path.x[0])):
@@ -214,9 +219,9 @@ class Fit:
         """The smoothed deviation from a path."""
         signals = self.signals.copy()
         signals[:, simulated.E], signals[:, simulated.OMEGA] = np.where(self.used, self.y - sim.y, 0.0), -path.omega
-        nw = len(self.var) - path.x.shape[1]
+        mean = np.concatenate([np.zeros(len(self.var) - len(self.mean)), self.mean - path.x[0]])
+        mean[: len(path.w)] = -path.w
         shift = -np.diff(path.x, axis=0, prepend=path.x[:1])
-        mean = np.concatenate([-path.w, np.zeros(nw - len(path.w)), self.mean - path.x[0]])
         return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), self.variances, cov)
 
     def minimise(self, path: Path) -> tuple[Path, Simulation, Solution]:
@@ -225,8 +230,8 @@ class Fit:
         for _ in range(STEPS):
             assert sim is not None
             found, before = self.linearised(sim, path), cost
-            nw = found.z.shape[1] - path.x.shape[1]
-            aim = Path(path.x + found.z[:, nw:], path.omega + found.omega, path.w + found.begin[: len(path.w)])
+            x = found.z[:, -path.x.shape[1] :]
+            aim = Path(path.x + x, path.omega + found.omega, path.w + found.begin[: len(path.w)])
             for k in range(HALVINGS):
                 trial = path.moved(aim, 0.5**k)
                 cost, other = self.tried(trial)
@@ -238,25 +243,24 @@ class Fit:
         assert sim is not None
         return path, sim, self.linearised(sim, path)
 
-    def estimate(self, free: Array, rounds: int) -> Simulation:
-        """The variances that are ``free`` (2 + n,) bool, as many times as the likelihood rises."""
-        self.path, sim, found = self.minimise(self.path)
-        power, least = 0.5, LEAST * self.variances * free
-        for _ in range(rounds if free.any() else 0):
-            before = self.variances
+    def estimate(self, rounds: int) -> None:
+        """The variances that are free, as many times as the likelihood rises."""
+        power, least = 0.5, LEAST * self.variances * self.free
+        for _ in range(rounds if self.free.any() else 0):
+            before, found = self.variances, self.found
             with np.errstate(divide="ignore", invalid="ignore"):
-                factor = np.where(free & (found.expected > 0.0), found.moved / found.expected, 1.0) ** power
-            self.variances = np.maximum(before * factor, least)
-            path, *other = self.minimise(self.path)
-            rise = other[1].loglik - found.loglik
+                factor = np.where(self.free & (found.expected > 0.0), found.moved / found.expected, 1.0)
+            self.variances = np.maximum(before * factor**power, least)
+            path, sim, found = self.minimise(self.path)
+            rise = found.loglik - self.found.loglik
             if rise > 0.0:
-                self.path, (sim, found), power = path, other, 1.5 * power
+                self.path, self.sim, self.found, power = path, sim, found, 1.5 * power
             else:
                 self.variances = before
-            if rise < RISE and power == 0.5:
-                break
-            power = power if rise >= RISE else 0.5
-        return sim
+            if rise < RISE:
+                if power <= 0.75:
+                    break
+                power = 0.5
 
 
 class OutputErrorPath(Printed):
@@ -279,12 +283,12 @@ class OutputErrorPath(Printed):
         Log-likelihood by Laplace's approximation.
     """
 
-    def __init__(self, run: Track, fit: Fit, sim: Simulation) -> None:
+    def __init__(self, run: Track, fit: Fit) -> None:
         self.run, self.system, self.names = run, fit.system, fit.system.names
-        found = fit.linearised(sim, fit.path, cov=True)
+        found = fit.linearised(fit.sim, fit.path, cov=True)
         self.theta, self.cov, self.loglik = fit.path.x, found.cov, found.loglik
         self.std = np.sqrt(np.maximum(np.einsum("tii->ti", found.cov), 0.0))
-        self.w, self.prediction = sim.w, sim.y
+        self.w, self.prediction = fit.sim.w, fit.sim.y
         (self.r, self.q_w), self.q = fit.variances[:2].tolist(), fit.variances[2:]
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
@@ -322,6 +326,7 @@ def output_error(
     forward: Basis | None = None,
     *,
     knots: bool = False,
+    start: Any = None,
     q: Any = None,
     r: float | None = None,
     q_w: float | None = None,
@@ -332,12 +337,14 @@ def output_error(
     Parameters
     ----------
     run : Track
-        A run of a `HammersteinWiener` model by any tracker, whose median coefficients after the first samples are
-        where the path begins; only its record, weights and intervals of time are used further.
+        A run of a `HammersteinWiener` model by any tracker, of which the record, its weights and intervals of time are
+        used. The path begins at the median of its coefficients after the first samples.
     forward : Basis or None
         Functions g_k of an output curve y = sum_k d_k g_k(w), in the place of the model's; the run needs none.
     knots : bool
         Estimate the knots of `PiecewiseLinear` and the centres of `Sigmoid` curves, as constants.
+    start : (n_x,) or None
+        Minimal parameters at which the path begins.
     q, r, q_w : numbers, q also (n_x,), or None
         Variances of drift, of the noise of y and of that of w, where they are known.
     rounds : int
@@ -361,26 +368,38 @@ def output_error(
         raise ValueError("output_error: knots= needs a curve that is PiecewiseLinear or a Sigmoid.")
     noise, drift = np.where(used, record.noise, np.inf), record.known.drift * record.known.interval * np.ones(len(run))
     drift[0] = 0.0
-    fit = Fit(system, record.y, np.stack([noise, drift]), _start(run, system))
-    fixed = np.concatenate([[np.nan if one is None else numbers("output_error", name, one, ndim=0, low=0.0)
-                             for name, one in (("r", r), ("q_w", q_w))],
-                            vector("output_error", "q", np.nan if q is None else q, model.structure.n_x)])  # fmt: skip
-    free = np.zeros(len(fit.variances), bool)
-    free[: len(fixed)] = np.isnan(fixed)
-    fit.variances[: len(fixed)] = np.where(np.isnan(fixed), fit.variances[: len(fixed)], fixed)
-    return OutputErrorPath(run, fit, fit.estimate(free, whole("output_error", "rounds", rounds, 0)))
+    fixed = np.zeros(2 + len(system.names))
+    fixed[:2] = [np.nan if one is None else numbers("output_error", name, one, ndim=0, low=0.0)
+                 for name, one in (("r", r), ("q_w", q_w))]  # fmt: skip
+    n_x = model.structure.n_x
+    fixed[2 : 2 + n_x] = vector("output_error", "q", np.nan if q is None else q, n_x)
+    xi = _median(run, given, system) if start is None else vector("output_error", "start", start, n_x)
+    path = Path(np.tile(np.concatenate([xi, *system.free]), (len(run), 1)), np.zeros(len(run)), np.zeros(model.na))
+    paths = [path] if system.forward or q_w == 0.0 else [path, _following(system, record.y, path)]
+    fits = [Fit(system, (record.y, noise, drift), one, fixed) for one in paths]
+    best = max(fits, key=lambda fit: fit.found.loglik)
+    best.estimate(whole("output_error", "rounds", rounds, 0))
+    return OutputErrorPath(run, best)
 
 
-def _start(run: Track, system: System) -> Path:
-    """The median of the coefficients of a run, with its poles inside the unit circle."""
+def _median(run: Track, given: HammersteinWiener, system: System) -> Array:
+    """The median of the coefficients of a run, (n_x,), with its poles inside the unit circle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        found = blocks_of(run)
-    s, T = system.model.structure, len(run)
-    xi = found.xi[min(burn_in(run.model.n), T // 2) :]
-    xi = np.median(xi[np.isfinite(xi).all(axis=1)], axis=0)
+        xi = blocks_of(run).xi[min(burn_in(run.model.n), len(run) // 2) :]
+    xi, s = np.median(xi[np.isfinite(xi).all(axis=1)], axis=0), system.model.structure
     xi[: s.na] = reflected(xi[: s.na])
-    d = s.spans(False).d
     if system.forward:
-        xi = np.insert(np.delete(xi, d[0] + np.arange(run.model.out.n - 1) if len(d) else []), [d[0]] * len(d), 0.0)
-    return Path(np.tile(np.concatenate([xi, *(np.array(own) for own in system.free)]), (T, 1)), np.zeros(T), np.zeros(s.na))
+        d = s.spans(False).d
+        xi = np.concatenate([xi[: d[0]], np.zeros(len(d)), xi[d[0] + given.out.n - 1 :]])
+    return np.asarray(xi)
+
+
+def _following(system: System, y: Array, path: Path) -> Path:
+    """The path with the omega that make w the measured level F(y)."""
+    s, T, known = system.model.structure, len(y), np.flatnonzero(np.isfinite(y))
+    g = system.at(path.x[0]).out.value(np.interp(np.arange(T), known, y[known]))
+    levels = np.sum(g * s.groups(path.x[:, : s.n_x])[3], axis=1)
+    off = np.concatenate([np.full(s.na, levels[0]), levels - system(path).w])
+    omega = off[s.na :] + sum(path.x[:, i] * off[s.na - 1 - i : s.na - 1 - i + T] for i in range(s.na))
+    return Path(path.x, omega, np.full(s.na, levels[0]))

@@ -10,9 +10,8 @@ backward recursion therefore carries the adjoint rho and its variance N (de Jong
     u = e / S - K' rho,   D = 1 / S + K' N K;      rho <- rho + H' u,   N <- (I - K H)' N (I - K H) + H' H / S
     z | all = z + P rho,  var = P - P N P;         before the time update: rho <- M' rho,  N <- M' N M
 
-and the derivatives of the log-likelihood by q_j, q_w and r are half of sum(moved - expected), with rho_j^2 and N_jj
-before the time update, rho_w^2 and N_ww after it, and u^2 and D, those of q and r times the factor of the sample. The sums vanish
-together at a maximum.
+and the derivatives of the log-likelihood by q_j, q_w and r are half of sum(moved - expected): of rho_j^2 - N_jj before
+the time update, rho_w^2 - N_ww after it, and u^2 - D, those of q and r times the factor of the sample.
 
 Sources: de Jong (1988), Koopman and Shephard (1992). Cost: O(T N^2), with covariances O(T N^3); N^2 numbers a sample.
 """
@@ -105,7 +104,7 @@ def forwards(p: Problem, v: Array, P: Array, K: Array, z: Array, row: Array) -> 
             row[i] = dot
             S += dot * p.of_e[t, i]
             e -= now[i] * p.of_e[t, i]
-        used = S < np.inf
+        used = p.signals[t, NOISE] < np.inf
         K[t, N], K[t, N + 1] = S, e if used else 0.0
         for i in range(N):
             K[t, i] = row[i] / S
@@ -183,6 +182,6 @@ def solve(p: Problem, variances: Array, cov: bool = False) -> Solution:
     P, K, z = np.empty((T, N, N)), np.empty((T, N + 2)), np.empty((T, N))
     loglik = float(forwards(p, variances, P, K, z, np.empty(N)))
     sums, of_cov = np.zeros((2, 2 + n)), np.zeros((T if cov else 0, n, n))
-    found = Solution(z, np.empty(T), np.empty(N), *sums, of_cov, loglik)
+    found = Solution(z, np.empty(T), np.empty(N), sums[0], sums[1], of_cov, loglik)
     backwards(p, variances, P, K, found, np.empty(N))
     return found
