@@ -82,6 +82,36 @@ def beam(M):
     return lambda leaves: sorted(leaves, key=lambda leaf: -leaf.logw)[:M]
 
 
+def uniform(seed, k):
+    """Number k of splitmix64."""
+    x = (seed * 2**32 + k * 0x9E3779B97F4A7C15) % 2**64
+    x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+    x = (x ^ x >> 27) * 0x94D049BB133111EB % 2**64
+    return ((x ^ x >> 31) >> 11) / 2**53
+
+
+def resampled(w, M, u):
+    """Weights after optimal resampling: those above c as they were, of the rest every c-th of their sum."""
+    if (w > 0.0).sum() <= M:
+        return w
+    c = next(c for k in range(M) for c in [np.sort(w)[: len(w) - k].sum() / (M - k)] if (w > c).sum() == k)
+    rest = np.where(w > c, 0.0, w)
+    hits = np.floor(np.cumsum(rest) / c - u) - np.floor((np.cumsum(rest) - rest) / c - u)
+    return np.where(w > c, w, hits * c)
+
+
+def resample(M, seed, Hm):
+    """The same at random; leaves by sensor, change and parent."""
+
+    def some(leaves):
+        leaves = sorted(leaves, key=lambda leaf: tuple((e % Hm, e // Hm) for e in leaf.history[-1:]))
+        w = np.exp([leaf.logw for leaf in leaves])
+        new = resampled(w / w.sum(), M, uniform(seed, len(leaves[0].history) - 1))
+        return [replace(leaf, logw=np.log(p)) for leaf, p in zip(leaves, new, strict=True) if p > 0.0]
+
+    return some
+
+
 def decide(depth, H):
     """Cut the branches that lose the decision on the event ``depth`` back."""
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from support import same
 
-from driftfit import ARX, Bank, Kalman, Regression, track
+from driftfit import ARX, Bank, Kalman, Live, Regression, track
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Resample
 from driftfit.bank.sensor import Sensor
 
 N, R = 2, 0.09
@@ -66,11 +66,12 @@ def compare(run, twin, y, u, atol=1e-10, lags=1):
     ("reduce", "naive", "lags"),
     [
         (Beam(7), naive_bank.beam(7), 5),
+        (Resample(7, seed=3), naive_bank.resample(7, 3, 2), 5),
         (Decide(3), naive_bank.decide(3, 6), 3),
         (GPB(2), naive_bank.gpb(2), 1),
         (GPB(3), naive_bank.gpb(3), 2),
     ],
-    ids=["Beam(7)", "Decide(3)", "GPB(2)", "GPB(3)"],
+    ids=["Beam(7)", "Resample(7)", "Decide(3)", "GPB(2)", "GPB(3)"],
 )
 def test_every_reduction_is_what_its_naive_twin_says(prior, reduce, naive, lags):
     transition, P, initial = PRIORS[prior]
@@ -78,6 +79,46 @@ def test_every_reduction_is_what_its_naive_twin_says(prior, reduce, naive, lags)
     initial = bank.event_probabilities[1]
     twin = naive_bank.Bank(Q, TABLE, P, initial, np.zeros(N), 2.0 * np.eye(N), naive)
     compare(track(Regression(N), bank, Y, U), twin, Y, U, lags=lags)
+
+
+def test_resampling_leaves_weights_right_on_average():
+    w = np.random.default_rng(8).dirichlet(np.full(20, 0.2))
+    new = np.array([naive_bank.resampled(w, 6, u) for u in (np.arange(4000) + 0.5) / 4000])
+    np.testing.assert_allclose(new.mean(axis=0), w, atol=2e-4)
+    np.testing.assert_allclose(new.sum(axis=1), 1.0, atol=1e-12)
+    assert ((new > 0.0).sum(axis=1) <= 6).all()
+
+
+def test_resampling_draws_the_same_numbers_in_every_mode():
+    bank = Bank(changes(), [Sensor.nominal(R)], reduce=Resample(3), p0=2.0)
+    alone, fleet = track(Regression(N), bank, Y, U), track(Regression(N), bank, [Y, Y], np.stack([U, U]), by="row")
+    live = Live(Regression(N), bank)
+    for t in range(len(Y)):
+        live.update(Y[t], U[t])
+        assert same(live.theta, alone.theta[t])
+    assert all(same(one.theta, alone.theta) for one in fleet.values())
+    other = Bank(changes(), [Sensor.nominal(R)], reduce=Resample(3, seed=1), p0=2.0)
+    assert not same(track(Regression(N), other, Y, U).theta, alone.theta)
+
+
+def test_bands_do_not_become_narrower_by_resampling():
+    """Frequent small jumps, of which many hypotheses remain: a beam of as many leaves has an NEES of 1.5."""
+    jumps = [Change(0.0), Change(2.25, prob=0.03)]
+    found = {}
+    for reduce in (Beam(5), Resample(5)):
+        bank, squares = Bank(jumps, [Sensor.nominal(1.0)], reduce=reduce, p0=10.0), []
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            z = rng.standard_normal((400, N))
+            jumped = (rng.random((400, 1)) < 0.03) * rng.normal(0.0, 1.5, (400, N))
+            theta = np.cumsum(jumped, axis=0)
+            run = track(Regression(N), bank, np.sum(z * theta, axis=1) + rng.standard_normal(400), z, keep="cov")
+            e, P = run.theta - theta, run.covariances()
+            P = np.tril(P) + np.tril(P, -1).swapaxes(1, 2)
+            squares.append(np.einsum("ti,tij,tj->t", e, np.linalg.inv(P), e).mean() / N)
+        found[type(reduce).__name__] = np.mean(squares)
+    assert found["Beam"] > 1.3
+    assert 0.85 < found["Resample"] < 1.15
 
 
 @pytest.mark.parametrize("prior", list(PRIORS))

@@ -7,7 +7,7 @@ from test_bank import N, R, changes, record, reported
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import IMM, Beam, Decide, Hybrid
+from driftfit.bank.reduction import IMM, Beam, Decide, Hybrid, Resample
 from driftfit.bank.sensor import Sensor
 
 JUMPS = (40, 90)
@@ -141,7 +141,7 @@ def test_known_changes_are_found_at_once():
     assert same(one.theta, track(Regression(N), BANK, y, u).theta)
 
 
-@pytest.mark.parametrize("reduce", [Beam(5), Decide(2), IMM(), Hybrid(5)], ids=str)
+@pytest.mark.parametrize("reduce", [Beam(5), Resample(3), Decide(2), IMM(), Hybrid(5)], ids=str)
 def test_what_is_not_used_moves_no_weight(reduce):
     """Also where it is missing for longer than the tree is deep."""
     y, u = record(60, 7, (30,))

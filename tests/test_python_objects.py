@@ -83,6 +83,7 @@ GPB(2)
 IMM()
 FirstFloor()
 Hybrid()
+Resample(16)
 """.strip().splitlines()
 """Expressions of models, trackers and their parts."""
 

@@ -101,7 +101,6 @@ PIECES: dict[str, Piece] = {
             "whitened",
             "rotate",
             "turn",
-            "machine_drift",
             "remember",
             "learn_drift",
         ),

@@ -138,7 +138,7 @@ def bank_of(rng: np.random.Generator, n: int) -> Any:
 
 def reduction(rng: np.random.Generator, H: int) -> Any:
     """A random reduction."""
-    from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+    from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Resample
 
     depth, leaves, window = (
         int(x) for x in (rng.integers(1, 5), rng.choice([1, 2, 7, 9, 22, 33, 64, 100]), rng.choice([1, 3, 8, 30]))
@@ -148,7 +148,8 @@ def reduction(rng: np.random.Generator, H: int) -> Any:
     kinds: list[Callable[[], Any]] = [
         lambda: Beam(leaves, window), lambda: Hybrid(leaves, min(window, 6), int(rng.integers(0, 3)), 20),
         lambda: Decide(depth, loss, force=True), lambda: Decide("auto", loss, depth, 0.01, wait, True),
-        lambda: GPB(min(depth, 3)), lambda: IMM(), lambda: FirstFloor(depth, str(rng.choice(["prior", "posterior"]))),
+        lambda: Resample(leaves, window), lambda: GPB(min(depth, 3)),
+        lambda: IMM(), lambda: FirstFloor(depth, str(rng.choice(["prior", "posterior"]))),
     ]  # fmt: skip
     return kinds[int(rng.integers(len(kinds)))]()
 

@@ -2,7 +2,7 @@
 
 from driftfit.bank.bank import Bank
 from driftfit.bank.change import Change
-from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Resample
 from driftfit.bank.results.pictures import plot_tree
 from driftfit.bank.sensor import Sensor
 from driftfit.checks import check_tracker
@@ -109,6 +109,7 @@ __all__ = [
     "Polynomial",
     "PolynomialModel",
     "Regression",
+    "Resample",
     "Saturation",
     "Sensor",
     "Sigmoid",

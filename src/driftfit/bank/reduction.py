@@ -59,7 +59,7 @@ class Reduction(Settings, ABC):
 
 def knobs(kind: int, **values: float) -> Array:
     """The vector of settings."""
-    vector = np.zeros(8)
+    vector = np.zeros(9)
     vector[selection.KIND], vector[selection.TAU], vector[selection.WAIT] = kind, -1.0, -1.0
     for name, value in values.items():
         vector[getattr(selection, name.upper())] = value
@@ -187,6 +187,29 @@ class Beam(Reduction):
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("Beam", Hd * Hm * self.leaves, 1, "use fewer leaves")
         return Shape(self.leaves, children, self.window, 1, knobs(selection.BEAM, leaves=self.leaves), np.ones(3))
+
+
+@dataclass(frozen=True)
+class Resample(Reduction):
+    """Keep leaves at random, with weights that are right on average (optimal resampling, Fearnhead and Clifford 2003).
+
+    Of more than ``leaves`` leaves those with w > c keep their weight, where sum min(w / c, 1) = leaves. The others get
+    the weight c or none: they are lined up by the times of their last changes, and those are kept that hold a point u,
+    u + c, u + 2 c, .. of the sum of their weights, u uniform in (0, c) (stratified, Fearnhead and Liu 2007). The
+    expected weight of every leaf is its weight, and of all unbiased choices this one has the least sum of variances, so
+    bands do not become narrower by pruning. ``seed`` and the number of the sample give u: a stream, a record and a
+    fleet draw the same numbers. Cost: leaves times H.
+    """
+
+    leaves: int = 16
+    window: int = REMEMBERED
+    seed: int = 0
+    lowest: ClassVar[dict[str, int]] = {"leaves": 1, "window": 1, "seed": 0}
+
+    def shape(self, Hd: int, Hm: int) -> Shape:
+        children = tree("Resample", Hd * Hm * self.leaves, 1, "use fewer leaves")
+        vector = knobs(selection.RESAMPLE, leaves=self.leaves, seed=self.seed)
+        return Shape(self.leaves, children, self.window, 1, vector, np.ones(3))
 
 
 @dataclass(frozen=True)

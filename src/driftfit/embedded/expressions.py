@@ -132,11 +132,12 @@ class Expressions:
         ]
         if not name:
             return view(owner, index)
-        if isinstance(node.ctx, ast.Store) or any(isinstance(one, range) for one in index):
+        part = any(isinstance(one, range) for one in index)
+        if isinstance(node.ctx, ast.Store) or part:
             self.unit.written.add(name)
-        if any(isinstance(one, range) for one in index):
+        if part:
             self.unit.beyond.add(name)
-        start = self.unit.start_of(name)
+        start = None if part else self.unit.start_of(name)
         return view(owner, index) if start is None else number(start)
 
     def _part(self, node: ast.Slice, size: int) -> range:

@@ -51,14 +51,13 @@ from driftfit.engine.settings import whole
 from driftfit.readings.repeats import note_reading
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
-    FRAME,
     frame,
     located_within,
     unseen_variance,
     whiten_within,
 )
 from driftfit.trackers.forms.covariance import prediction
-from driftfit.trackers.forms.diffuse import ENTERING, knowing_nothing, spanned_variance
+from driftfit.trackers.forms.diffuse import ENTERING, MACHINES, knowing_nothing, spanned_variance
 from driftfit.trackers.forms.excitation import (
     FIRST,
     learn_information,
@@ -86,7 +85,6 @@ from driftfit.trackers.mixture.learned import (
     learn_colour,
     learn_drift,
     learn_means,
-    machine_drift,
     nothing_learned,
     start_density,
     take_start,
@@ -127,7 +125,7 @@ def settle(s: State, l: int) -> None:
 def look_ahead(s: State, l: int) -> None:
     """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
     whiten_noise(s, l)
-    column = whiten_within(s, s.white.ctypes.data, l)
+    column = whiten_within(s, s.white[:, l], l)
     noise_prior(s, l)
     innovate(s, l)
     if column >= 0:
@@ -276,7 +274,7 @@ class AdaptiveKalman(Tracker):
             nothing,
             store=keep_density,
             store_for_smoother=store_for_smoother,
-            machines=(*FRAME, machine_drift),
+            machines=MACHINES,
             doubts=True,
             outlined=True,
             note=note_reading,

@@ -190,8 +190,8 @@ class Kalman(Tracker):
 
     @property
     def width(self) -> int:  # type: ignore[override]
-        """The square root is updated by a routine that takes one lane at a time."""
-        return 1 if self.form == "sqrt" else super().width
+        """Square roots and laws are updated by routines that take one lane at a time."""
+        return 1 if self.form == "sqrt" or self.laws is not None else super().width
 
     @property
     def steps(self) -> TrackerSteps:

@@ -49,12 +49,14 @@ from driftfit.bank.reducing.selection import (
     KIND,
     MERGE,
     REFILTER,
+    RESAMPLE,
     WAIT,
     beam,
     decide,
     hybrid,
     merge,
     number,
+    resample,
 )
 from driftfit.engine.kernel import machine, shared
 from driftfit.engine.simd import WIDTH
@@ -181,6 +183,8 @@ def choose(t: Any, L: int) -> None:
         t.groups = merge(t, L)
     elif kind == BEAM:
         t.groups = beam(t, L)
+    elif kind == RESAMPLE:
+        t.groups = resample(t, L)
     elif kind == HYBRID:
         t.groups = hybrid(t, L)
 
@@ -191,7 +195,7 @@ def reduce(t: Any) -> int:
     L, kind, order = t.many_leaves, int(t.reduction[KIND]), t.order
     t.kept = 1.0
     full = kind == REFILTER and t.stored >= int(t.reduction[DEPTH])
-    alone = kind in (CUT, BEAM)  # every group is one leaf, in order
+    alone = kind in (CUT, BEAM, RESAMPLE)  # every group is one leaf, in order
     if kind == REFILTER and not full:
         for l in range(L):
             order[l] = l
@@ -213,7 +217,7 @@ def reduce(t: Any) -> int:
         kept = take(t, G)
     else:
         kept = combine(t, L, G)
-    t.kept = min(kept, 1.0)
+    t.kept = 1.0 if kind == RESAMPLE else min(kept, 1.0)
     return int(G)
 
 

@@ -33,10 +33,11 @@ from driftfit.bank.machine.framed import begin_framed, frame_theta, outgrown, re
 from driftfit.engine.drivers import COMMON, TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing
 from driftfit.readings.repeats import resolve
-from driftfit.trackers.forms.coordinates import FRAME, new_row, whiten_within
+from driftfit.trackers.forms.coordinates import new_row, whiten_within
 from driftfit.trackers.forms.covariance import prediction
 from driftfit.trackers.forms.diffuse import (
     ENTERING,
+    MACHINES,
     NOISE,
     NOW,
     OK,
@@ -200,7 +201,7 @@ def forecast_tree(s: State, l: int) -> None:
     """The forecast of the tree, in theta or in coordinates of the start."""
     column, y_hat, outside = -1, 0.0, False
     if s.counters[COUNTER.framed, l] > 0:
-        column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
+        column, y_hat = whiten_within(s, s.phi[:, l], l), prediction(s, l)
         outside = column >= 0
     if not outside and s.ok[l] > 0.0 and s.can_frame[l] > 0:
         column = outgrown(s, l)
@@ -297,7 +298,7 @@ def read(s: State, l: int) -> None:
 
 
 STEPS = TrackerSteps(
-    nothing, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*FRAME, bank),
+    nothing, forecast, correct, read, nothing, store=keep, read_extra=take_known, machines=(*MACHINES, bank),
     outlined=True, note=resolve,
 )  # fmt: skip
 

@@ -10,15 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, SENSORS, WEIGHT
+from driftfit.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, LOG, SENSORS, WEIGHT
 from driftfit.bank.reducing.lookahead import expected_risk
-from driftfit.engine.kernel import Array, kernel, shared
+from driftfit.engine.kernel import Array, kernel, log, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, sum_of
 
-CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
+CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER, RESAMPLE = range(7)
 """Kinds of reduction."""
-KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD = range(8)
+KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD, SEED = range(9)
 """Entries of the vector of settings of a reduction."""
+STEP, MIX, MIX_2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+"""Constants of the random numbers splitmix64 (Steele, Lea and Flood 2014)."""
 
 
 @kernel
@@ -79,6 +81,48 @@ def clear(V: Array, row: int, count: int) -> None:
 def beam(t: Any, L: int) -> int:
     """The heaviest leaves."""
     return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order))
+
+
+@kernel
+def uniform(seed: float, k: int) -> float:
+    """The k-th random number in [0, 1) of splitmix64."""
+    x = (np.uint64(seed) << np.uint64(32)) + np.uint64(k) * STEP
+    x = (x ^ (x >> np.uint64(30))) * MIX
+    x = (x ^ (x >> np.uint64(27))) * MIX_2
+    return float((x ^ (x >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
+
+
+@shared
+def common_weight(w: Array, M: int) -> float:
+    """The c with sum min(w / c, 1) = M, from above; 0 if no more than M weights are positive."""
+    c, lower, positive = np.inf, 2.0, 0
+    while lower < c:
+        c, heavy, rest, positive = lower, 0, 0.0, 0
+        for l in range(len(w)):
+            heavy, rest = (heavy + 1, rest) if w[l] > c else (heavy, rest + w[l])
+            positive += 1 if w[l] > 0.0 else 0
+        lower = rest / (M - heavy) if positive > M else 0.0
+    return c
+
+
+@shared
+def resample(t: Any, L: int) -> int:
+    """The leaves of `driftfit.bank.reduction.Resample`, which are in the order of their last changes, as children with
+    a change come after those without. New weights are in the logarithms alone: the mixture is still that of the old.
+    """
+    B, M, G = t.leaves, int(t.reduction[LEAVES]), 0
+    c = common_weight(B[WEIGHT, :L], M)
+    u = c * uniform(t.reduction[SEED], t.clock)
+    for l in range(L):
+        heavy = B[WEIGHT, l] > c
+        u -= 0.0 if heavy else B[WEIGHT, l]
+        kept = (heavy or u < 0.0) and G < M
+        if kept and not heavy:
+            B[LOG, l] = log(c)
+            u += c
+        t.group[l], t.order[G] = G if kept else -1, l
+        G += 1 if kept else 0
+    return G
 
 
 @shared

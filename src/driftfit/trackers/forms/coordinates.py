@@ -29,24 +29,10 @@ for x; O(n^3) where a column enters.
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, machine, shared
-from driftfit.trackers.forms.diffuse import (
-    ENTERING,
-    MACHINES,
-    NOW,
-    ROW,
-    SQUARE,
-    VOLUME,
-    WORK,
-    estimate,
-    outside,
-    refresh,
-    unseen,
-)
+from driftfit.engine.kernel import Array, State, exp, kernel, shared
+from driftfit.trackers.forms.diffuse import ENTERING, ROW, SQUARE, VOLUME, estimate, outside, refresh, unseen
 
 OUTGROWN = 1e12
 """Smallest information that one sample adds to a coordinate, as a multiple of the earlier information, at which the
@@ -66,42 +52,12 @@ def place(phi: Array, S: Array, work: Array, now: Array) -> None:
         work[ROW, i] = 0.0
 
 
-@partial(machine, short=True)
-def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int) -> None:
-    """`place` for lane l of L, from the addresses of fields."""
-    place(
-        floats(phi, n, L)[:, l], cubes(S, n, n, L)[:, :, l], cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l]
-    )
-
-
-@partial(machine, short=True)
-def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l: int) -> None:
-    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has determined."""
-    S_l, R_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l]
-    refresh(S_l, R_l, cubes(work, WORK, n, L)[:, :, l])
-    floats(now, NOW, L)[VOLUME, l] = unseen(S_l, R_l, cubes(Q, n, n, L)[:, :, l], 0.0)
-
-
-@partial(machine, short=True)
-def machine_estimate(S: int, z: int, Q: int, theta: int, work: int, n: int, L: int, l: int) -> None:
-    """theta for lane l of L: M^-1 z, unchanged in the directions of Q."""
-    estimate(
-        cubes(S, n, n, L)[:, :, l], floats(z, n, L)[:, l], cubes(Q, n, n, L)[:, :, l], floats(theta, n, L)[:, l],
-        cubes(work, WORK, n, L)[ROW, :, l], 0.0,
-    )  # fmt: skip
-
-
-FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
-"""The routines that steps in these coordinates call."""
-
-
 @kernel
-def whiten_within(s: State, phi: int, l: int) -> int:
-    """x of the regressor at address ``phi`` if columns are free; returns the column along which it leaves the span of
-    earlier regressors, or -1."""
-    n, L = s.d.shape
-    machine_place(s.S.ctypes.data, phi, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
-    for i in range(n):
+def whiten_within(s: State, phi: Array, l: int) -> int:
+    """x of a regressor if columns are free; returns the column along which it leaves the span of earlier regressors, or
+    -1."""
+    place(phi, s.S[:, :, l], s.work[:, :, l], s.at_start[:, l])
+    for i in range(s.d.shape[0]):
         s.x[i, l] = s.work[ROW, i, l]
     return int(s.at_start[ENTERING, l])
 
@@ -109,11 +65,9 @@ def whiten_within(s: State, phi: int, l: int) -> int:
 @kernel
 def frame(s: State, l: int) -> None:
     """After a change of M: its inverse R, and s.H, a basis of what is not determined."""
-    n, L = s.d.shape
-    machine_frame(
-        s.S.ctypes.data, s.R.ctypes.data, s.H.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l
-    )
-    s.root[l] = 1 if s.rank[l] < n else 0
+    refresh(s.S[:, :, l], s.R[:, :, l], s.work[:, :, l])
+    s.at_start[VOLUME, l] = unseen(s.S[:, :, l], s.R[:, :, l], s.H[:, :, l], 0.0)
+    s.root[l] = 1 if s.rank[l] < s.d.shape[0] else 0
 
 
 @kernel
@@ -143,10 +97,7 @@ def new_row(s: State, phi: Array, j: int, l: int) -> float:
 @kernel
 def located_within(s: State, l: int) -> None:
     """theta = M^-1 d where columns are free: it does not change in the directions without information."""
-    n, L = s.d.shape
-    machine_estimate(
-        s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.theta.ctypes.data, s.work.ctypes.data, n, L, l
-    )
+    estimate(s.S[:, :, l], s.d[:, l], s.H[:, :, l], s.theta[:, l], s.work[ROW, :, l], 0.0)
 
 
 @kernel

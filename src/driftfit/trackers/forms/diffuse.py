@@ -451,14 +451,6 @@ def correct_on_roots(s: State, l: int) -> None:
 
 
 @kernel
-def take_in(s: State, l: int) -> None:
-    """A sample in square-root form: theta, P, and s.y_hat, s.e, s.s."""
-    forecast_on_roots(s, l)
-    s.s[l] = s.h[l] + s.r[l] * s.noise[l]
-    absorb_on_roots(s, l)
-
-
-@kernel
 def reform(s: State, l: int) -> None:
     """Recompute P from the square root, after a change that is not a sample."""
     foresee_row(s, s.theta.ctypes.data, s.phi.ctypes.data, l)
@@ -471,13 +463,6 @@ def take_over(s: State, l: int) -> None:
     n, L = s.d.shape
     machine_root(s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, s.theta.ctypes.data, n, L, l)
     s.root[l] = 1
-
-
-@kernel
-def enter(s: State, l: int) -> None:
-    """The correction while the state is in square-root form, and the change to a covariance once that is accurate."""
-    take_in(s, l)
-    hand_over(s, l)
 
 
 @kernel

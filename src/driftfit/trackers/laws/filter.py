@@ -31,20 +31,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import (
-    Array,
-    State,
-    cubes,
-    exp,
-    floats,
-    kernel,
-    log,
-    machine,
-    nothing,
-    packed,
-    shared,
-    wholes,
-)
+from driftfit.engine.kernel import Array, State, exp, kernel, log, nothing, shared
 from driftfit.trackers.forms.covariance import LEFT, read_drift
 from driftfit.trackers.laws.law import (
     COSINE,
@@ -55,7 +42,6 @@ from driftfit.trackers.laws.law import (
     OWNER,
     PLAIN,
     RATE,
-    ROWS,
     SINE,
     SLOPE,
     VISIBLE,
@@ -69,17 +55,13 @@ LOG_2_PI = 1.8378770664093453
 H, G, B, W, WORK = range(5)
 """Rows of ``work``: h, C h, a, and a row that is turned into R."""
 
-TIME, DRIFT, Y, OK, R, Y_HAT, E, S, REACHED, TOTAL, NOW = range(11)
-"""Entries of ``now``: the interval, the factor of the drift, the output, whether it is used, the noise variance; the
-prediction, the innovation and its variance as if delta were known, whether y depends on delta; and -2 times the
-logarithm of the likelihood of what delta took."""
-
-(AT_LAW, AT_ROOT, AT_X, AT_C, AT_A, AT_R, AT_Z, AT_FREE, AT_PHI, AT_THETA, AT_P, AT_VAR, AT_WORK, AT_NOW, AT_F,
- ADDRESSES) = range(16)  # fmt: skip
-
 
 def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, float]) -> Mapping[str, Any]:
-    """Fields before the first sample; ``means`` are known means, by the place of their parameter."""
+    """Fields before the first sample; ``means`` are known means, by the place of their parameter.
+
+    Of every sample ``known`` is h as if delta were known, and ``reached`` whether y depends on delta; ``total`` is -2
+    times the logarithm of the likelihood of what delta took.
+    """
     n, N = len(theta0), table.shape[1]
     x, C, free = np.zeros(N), np.zeros((N, N)), np.ones(N)
     first = [int(np.argmax(table[OWNER] == i)) for i in range(n)]
@@ -96,8 +78,9 @@ def state(table: Array, theta0: Array, p0: Array | None, means: Mapping[int, flo
     shown = (table[OWNER] == np.arange(n)[:, None]) * table[VISIBLE]
     return {
         "theta": shown @ x, "P": shown @ C @ shown.T, "law": table, "x": x, "C": C, "A": np.diag(free),
-        "R": np.zeros((N, N)), "z": np.zeros(N), "free": free,
-        "work": np.zeros((WORK, N)), "now": np.zeros(NOW), "drift_root": np.ones(n), "F": np.ones(N),
+        "triangle": np.zeros((N, N)), "z": np.zeros(N), "free": free,
+        "work": np.zeros((WORK, N)), "known": 0.0, "reached": 0.0, "total": 0.0, "drift_root": np.ones(n),
+        "F": np.ones(N),
     }  # fmt: skip
 
 
@@ -145,20 +128,20 @@ def spread(law: Array, root: Array, C: Array, dt: float, drift: float) -> None:
 
 
 @shared
-def measure(law: Array, x: Array, C: Array, phi: Array, work: Array, now: Array) -> None:
-    """h, C h, y_hat, e, and the variance of the prediction as if delta were known."""
+def measure(law: Array, x: Array, C: Array, phi: Array, work: Array) -> tuple[float, float]:
+    """h, C h; returns y_hat, and the variance of the prediction as if delta were known."""
     N = len(C)
     y_hat, variance = 0.0, 0.0
     for k in range(N):
         work[H, k] = phi[int(law[OWNER, k])] * law[VISIBLE, k]
-        y_hat += work[H, k] * x[k, 0]
+        y_hat += work[H, k] * x[k]
     for k in range(N):
         g = 0.0
         for j in range(N):
             g += C[k, j] * work[H, j]
         work[G, k] = g
         variance += work[H, k] * g
-    now[Y_HAT], now[E], now[S] = y_hat, now[Y] - y_hat, variance
+    return y_hat, variance
 
 
 @shared
@@ -176,11 +159,10 @@ def reach(A: Array, free: Array, work: Array) -> bool:
 
 
 @shared
-def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
-    gain = now[OK] / now[S]
+def correct_state(x: Array, C: Array, work: Array, gain: float, e: float) -> None:
     for i in range(len(C)):
         k = gain * work[G, i]
-        x[i, 0] += k * now[E]
+        x[i] += k * e
         for j in range(i):
             C[i, j] -= k * work[G, j]
             C[j, i] = C[i, j]
@@ -188,14 +170,15 @@ def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
 
 
 @shared
-def inform(A: Array, R: Array, z: Array, work: Array, now: Array) -> None:
-    """Take the sample as information about delta: turn a / sqrt(s), e / sqrt(s) into R, z."""
-    N, root, row = len(A), 1.0 / np.sqrt(now[S]), work[W]
+def inform(A: Array, R: Array, z: Array, work: Array, e: float, v: float) -> float:
+    """Take the sample, of variance v, as information about delta: turn a / sqrt(v), e / sqrt(v) into R, z; returns -2
+    times the logarithm of its likelihood."""
+    N, root, row = len(A), 1.0 / np.sqrt(v), work[W]
     for d in range(N):
         row[d] = work[B, d] * root
         for c in range(N):
-            A[d, c] -= work[G, d] * work[B, c] / now[S]
-    left = now[E] * root
+            A[d, c] -= work[G, d] * work[B, c] / v
+    left = e * root
     for d in range(N):
         if row[d] != 0.0:
             length = np.sqrt(R[d, d] * R[d, d] + row[d] * row[d])
@@ -205,7 +188,8 @@ def inform(A: Array, R: Array, z: Array, work: Array, now: Array) -> None:
                 R[d, c], row[c] = ahead * one + aside * other, ahead * other - aside * one
             one = z[d]
             z[d], left = ahead * one + aside * left, ahead * left - aside * one
-    now[TOTAL] += LOG_2_PI + log(now[S]) + now[E] * now[E] / now[S]
+    found: float = LOG_2_PI + log(v) + e * e / v
+    return found
 
 
 @shared
@@ -225,7 +209,7 @@ def settle(x: Array, C: Array, A: Array, R: Array, z: Array, free: Array) -> flo
                 for c in range(d):
                     A[i, d] -= R[c, d] * A[i, c] if R[c, c] > 0.0 else 0.0
                 A[i, d] /= R[d, d]
-                x[i, 0] += A[i, d] * z[d]
+                x[i] += A[i, d] * z[d]
                 for j in range(i + 1):
                     C[i, j] += A[i, d] * A[j, d]
                     C[j, i] = C[i, j]
@@ -247,7 +231,7 @@ def show(law: Array, x: Array, C: Array, A: Array, theta: Array, P: Array, var: 
             P[i, j] = 0.0
     for k in range(N):
         i = int(law[OWNER, k])
-        theta[i] += law[VISIBLE, k] * x[k, 0]
+        theta[i] += law[VISIBLE, k] * x[k]
         for j in range(N):
             P[i, int(law[OWNER, j])] += law[VISIBLE, k] * law[VISIBLE, j] * C[k, j]
     for i in range(n):
@@ -258,88 +242,46 @@ def show(law: Array, x: Array, C: Array, A: Array, theta: Array, P: Array, var: 
                 var[int(law[OWNER, k])] = np.inf
 
 
-@machine
-def machine_forecast(fields: int, n: int, N: int, L: int, l: int) -> None:
-    """Time update and prediction of lane l of L."""
-    at = wholes(fields, 1, ADDRESSES)
-    law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
-    x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
-    A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
-    dt = now[TIME]
+@kernel
+def predict(s: State, l: int) -> None:
+    """The time update."""
+    law, C, dt = s.law[:, :, l], s.C[:, :, l], s.dt[l]
     if dt > 0.0:
-        forward(law, x, dt)
-        forward(law, A, dt)
+        forward(law, s.x[:, l : l + 1], dt)
+        forward(law, s.A[:, :, l], dt)
         forward(law, C, dt)
         turn_over(C)
         forward(law, C, dt)
-        spread(law, floats(at[0, AT_ROOT], n, L)[:, l], C, dt, now[DRIFT])
-    measure(law, x, C, floats(at[0, AT_PHI], n, L)[:, l], work, now)
-    now[REACHED] = 1.0 if reach(A, floats(at[0, AT_FREE], N, L)[:, l], work) else 0.0
-
-
-@machine
-def machine_correct(fields: int, n: int, N: int, L: int, l: int) -> None:
-    """Correction of lane l of L, and what is shown of it."""
-    at = wholes(fields, 1, ADDRESSES)
-    law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
-    x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
-    A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
-    U, z = cubes(at[0, AT_R], N, N, L)[:, :, l], floats(at[0, AT_Z], N, L)[:, l]
-    now[S] += now[R]
-    informs = now[REACHED] > 0.0 and now[OK] > 0.0
-    if informs:
-        inform(A, U, z, work, now)
-    correct_state(x, C, work, now)
-    if informs:
-        free = floats(at[0, AT_FREE], N, L)[:, l]
-        taken = settle(x, C, A, U, z, free)
-        if taken != 0.0:
-            now[TOTAL] += taken
-            for k in range(N):  # the factors of the diffuse likelihood, whose logarithms add up to the total
-                cubes(at[0, AT_F], N, 1, L)[k, 0, l] = exp(now[TOTAL] / N)
-    theta, var = floats(at[0, AT_THETA], n, L)[:, l], floats(at[0, AT_VAR], n, L)[:, l]
-    show(law, x, C, A, theta, cubes(at[0, AT_P], n, n, L)[:, :, l], var)
-
-
-def calling(machine_of_laws: Any) -> Any:
-    """A kernel that calls a routine with the addresses of the fields."""
-
-    @kernel
-    def call(s: State, l: int) -> None:
-        N, L = s.x.shape
-        fields = packed((
-            s.law.ctypes.data, s.drift_root.ctypes.data, s.x.ctypes.data, s.C.ctypes.data, s.A.ctypes.data,
-            s.R.ctypes.data, s.z.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
-            s.P.ctypes.data, s.var.ctypes.data, s.work.ctypes.data, s.now.ctypes.data,
-            s.F.ctypes.data,
-        ))  # fmt: skip
-        machine_of_laws(fields, s.theta.shape[0], N, L, l)
-
-    return call
-
-
-call_forecast, call_correct = calling(machine_forecast), calling(machine_correct)
+        spread(law, s.drift_root[:, l], C, dt, s.drift[l])
 
 
 @kernel
 def forecast(s: State, l: int) -> None:
-    """The time update, and y_hat, e, h."""
-    s.now[TIME, l], s.now[DRIFT, l], s.now[Y, l] = s.dt[l], s.drift[l], s.y[l]
-    call_forecast(s, l)
-    s.y_hat[l], s.e[l] = s.now[Y_HAT, l], s.now[E, l]
-    s.h[l] = np.inf if s.now[REACHED, l] > 0.0 else s.now[S, l]
+    """y_hat, e, and h."""
+    work = s.work[:, :, l]
+    y_hat, s.known[l] = measure(s.law[:, :, l], s.x[:, l], s.C[:, :, l], s.phi[:, l], work)
+    reached = reach(s.A[:, :, l], s.free[:, l], work)
+    s.reached[l] = 1.0 if reached else 0.0
+    s.y_hat[l], s.e[l], s.h[l] = y_hat, s.y[l] - y_hat, np.inf if reached else s.known[l]
 
 
 @kernel
 def correct(s: State, l: int) -> None:
-    """The correction, which writes the variances too."""
-    s.now[OK, l], s.now[R, l] = s.ok[l], s.r[l] * s.noise[l]
-    call_correct(s, l)
+    """The correction, and what is shown of it."""
+    x, C, A, R, z, work = s.x[:, l], s.C[:, :, l], s.A[:, :, l], s.triangle[:, :, l], s.z[:, l], s.work[:, :, l]
+    v, N = s.known[l] + s.r[l] * s.noise[l], s.x.shape[0]
+    informs = (s.reached[l] > 0.0) & (s.ok[l] > 0.0)
+    if informs:
+        s.total[l] += inform(A, R, z, work, s.e[l], v)
+    correct_state(x, C, work, s.ok[l] / v, s.e[l])
+    if informs:
+        taken = settle(x, C, A, R, z, s.free[:, l])
+        if taken != 0.0:
+            s.total[l] += taken
+            for k in range(N):  # the factors of the diffuse likelihood, whose logarithms add up to the total
+                s.F[k, l] = exp(s.total[l] / N)
+    show(s.law[:, :, l], x, C, A, s.theta[:, l], s.P[:, :, l], s.var[:, l])
 
 
-STEPS = TrackerSteps(
-    nothing, forecast, correct, nothing, read_extra=read_drift, machines=(machine_forecast, machine_correct)
-)
-"""The first `nothing`: the routine of the forecast begins with the time update. The last: that of the correction
-reports.
-"""
+STEPS = TrackerSteps(predict, forecast, correct, nothing, read_extra=read_drift, outlined=True)
+"""The correction reports."""

@@ -42,7 +42,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, exp, kernel, log, machine, shared
+from driftfit.engine.kernel import Array, State, exp, kernel, log, shared
 from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.forms.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
 from driftfit.trackers.mixture.filters import absorb, project, wander
@@ -305,16 +305,6 @@ def turn(t: Array) -> None:
         t[WEIGHT, i] *= 1.0 - share
 
 
-@partial(machine, short=True)
-def machine_drift(past: int, newest: int, sums: int, n: int, L: int, l: int) -> None:
-    """A pass for lane l of L, from the addresses of fields."""
-    t = cubes(sums, A + 6 * n, n, L)[:, :, l]
-    look_back(cubes(past, WINDOW, PHI + 2 * n, L)[:, :, l], newest, t)
-    diagonal(t)
-    whitened(t)
-    turn(t)
-
-
 @partial(kernel, inline=False)
 def remember(s: State, at: int, l: int) -> None:
     """Store a sample that the filters used, in units of r and c."""
@@ -356,8 +346,11 @@ def learn_drift(s: State, l: int) -> None:
     remember(s, at, l)
     s.remembered[l] += 1
     if s.remembered[l] % BLOCK == 0 and s.remembered[l] >= WINDOW:
-        n, L = s.d.shape
-        machine_drift(s.samples.ctypes.data, at, s.sums.ctypes.data, n, L, l)
+        t = s.sums[:, :, l]
+        look_back(s.samples[:, :, l], at, t)
+        diagonal(t)
+        whitened(t)
+        turn(t)
 
 
 @kernel
