@@ -240,10 +240,11 @@ class Bench:
         out = result.theta, result.reason, result.errors
         done = loop(tile, y, u, 0, *out)
         if tile["gate_replay"][0, 0] > 0:
-            first = replayed({name: tile[name][0, ..., 0] for name in tile.dtype.names}, self.m)
+            first = replayed(tile, self.m)
             result.tile, k = tile_of(own | {"gate_decided": 1}), len(first.y)
-            loop(result.tile, *first.without_codes(), 0, *(np.zeros_like(one[:k]) for one in out))
-            result.reason[done - k + np.flatnonzero(first.codes.any(1))] = AT_START
+            signals = (np.ascontiguousarray(one[..., 0]) for one in first.without_codes())
+            loop(result.tile, *signals, 0, *(np.zeros_like(one[:k]) for one in out))
+            result.reason[done - k + np.flatnonzero(first.codes[..., 0].any(1))] = AT_START
             loop(result.tile, y, u, done, *out)
         return result
 

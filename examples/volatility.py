@@ -1,4 +1,4 @@
-"""Noise whose variance moves: `Kalman(volatility=...)` and the default tracker against GARCH(1, 1).
+"""Noise whose variance moves: ``volatility`` of `Kalman` and of the default tracker against GARCH(1, 1).
 
 Records of 2000 returns about a level: settings are estimated on the first half, by maximum likelihood, and judged on
 the second. Four kinds are simulated; rows are means of four records. With `pip install arch` the data sets of that
@@ -66,25 +66,25 @@ def scored(tracker, y):
     return run.log_density, run.innovation / (1.96 * run.innovation_std)
 
 
-def moving(y, half):
-    """The same with the volatility and the first r that are likeliest on the first half."""
-    grid = [Kalman(q=0.0, r=r * y[:half].var(), volatility=v) for v in VOLATILITIES for r in (0.25, 0.5, 1.0, 2.0, 4.0)]
-    runs = track(LEVEL, grid, y[:half])
-    best = max(runs.values(), key=lambda run: run.loglik).tracker
-    return scored(best, y)
+def likeliest(grid, y, half):
+    """The same with the settings that are likeliest on the first half."""
+    runs = track(LEVEL, grid, y[:half], gate=False)
+    return scored(max(runs.values(), key=lambda run: run.loglik).tracker, y)
 
 
 def row(name, records):
     found = []
     for y in records:
-        half = len(y) // 2
+        half, V = len(y) // 2, VOLATILITIES
+        r = y[:half].var()
         for density, z in (
-            scored(Kalman(q=0.0, r=y[:half].var()), y), garch(y, half, False), garch(y, half, True), moving(y, half),
-            scored(AdaptiveKalman(), y),
+            scored(Kalman(q=0.0, r=r), y), garch(y, half, False), garch(y, half, True),
+            likeliest([Kalman(q=0.0, r=r * k, volatility=v) for v in V for k in (0.25, 0.5, 1.0, 2.0, 4.0)], y, half),
+            scored(AdaptiveKalman(), y), likeliest([AdaptiveKalman(volatility=v) for v in V], y, half),
         ):  # fmt: skip
             found += [density[half:].mean(), np.mean(np.abs(z[half:]) < 1.0)]
-    means = np.mean(np.reshape(found, (len(records), 5, 2)), axis=0)
-    print(f"{name:26}" + "".join(f"{score:9.3f} ({inside:.3f})" for score, inside in means))
+    means = np.mean(np.reshape(found, (len(records), 6, 2)), axis=0)
+    print(f"{name:23}" + "".join(f"{score:8.3f} ({inside:.3f})" for score, inside in means))
 
 
 def market(name):
@@ -96,7 +96,8 @@ def market(name):
 
 
 print("mean log predictive density of the second half (share within 95 % bands)")
-print(f"{'':26}{'constant r':>17}{'GARCH(1, 1)':>17}{'with Student t':>17}{'volatility':>17}{'default':>17}")
+heads = "constant r", "GARCH(1, 1)", "with Student t", "volatility", "default", "its volatility"
+print(" " * 23 + "".join(f"{head:>16}" for head in heads))
 if sys.argv[1:]:
     for name in sys.argv[1:]:
         row(name, [market(name)])

@@ -89,15 +89,50 @@ def test_resampling_leaves_weights_right_on_average():
     assert ((new > 0.0).sum(axis=1) <= 6).all()
 
 
-def test_resampling_draws_the_same_numbers_in_every_mode():
-    bank = Bank(changes(), [Sensor.nominal(R)], reduce=Resample(3), p0=2.0)
+def test_open_probabilities_are_the_means_of_expected_counts():
+    """A twin hands in the prior of every sample; two changes are too large for this record, and become rare."""
+    open_changes, given = (
+        [Change(q, prob=p) for q, p in zip((0.0, 1.0, 9.0, 1e4), prob, strict=True)]
+        for prob in ([None] * 4, [0.7, 0.1, 0.1, 0.1])
+    )
+    run = track(Regression(N), Bank(open_changes, SENSORS, reduce=Hybrid(5, remembered=4), p0=2.0), Y, U)
+    bank = Bank(given, SENSORS, reduce=Hybrid(5, remembered=4), p0=2.0)
+    live, start = Live(Regression(N), bank), np.array([99.0, *[1.0 / 3.0] * 3])
+    counts = start.copy()
+    for t in range(len(Y)):
+        live.update(Y[t], U[t], prob=counts / counts.sum())
+        counts += (
+            bank.reported(live.lane()["report"], "lag_prob")[-1].reshape(4, 2).sum(axis=1) - (counts - start) / 500
+        )
+        np.testing.assert_allclose(run.theta[t], live.theta, atol=1e-10)
+    rates = run.hypotheses.rates
+    assert rates["change 1"] > 1.0 / 300.0 > rates["change 3"]
+    assert run.smooth().prior[5, 1:].sum() == pytest.approx(1.0 - rates["none"])
+
+
+def test_rate_and_size_of_jumps_are_learned():
+    rng = np.random.default_rng(5)
+    z, jumped = rng.standard_normal((1500, N)), rng.random((1500, 1)) < 0.05
+    theta = np.cumsum(jumped * rng.normal(0.0, 5.0, (1500, N)), axis=0)
+    run = track(Regression(N), Bank(Change.unknown()), np.sum(z * theta, axis=1) + rng.standard_normal(1500), z)
+    rates = run.hypotheses.rates
+    assert rates["jump 5"] == pytest.approx(jumped.mean(), rel=0.3)
+    assert max(rates["jump 50"], rates["jump 500"]) < 0.005
+
+
+OPEN = [Change(0.0), Change(0.6), Change(60.0)]
+
+
+@pytest.mark.parametrize("changes", [changes(), OPEN], ids=["given", "learned"])
+def test_resampling_draws_the_same_numbers_in_every_mode(changes):
+    bank = Bank(changes, [Sensor.nominal(R)], reduce=Resample(3), p0=2.0)
     alone, fleet = track(Regression(N), bank, Y, U), track(Regression(N), bank, [Y, Y], np.stack([U, U]), by="row")
     live = Live(Regression(N), bank)
     for t in range(len(Y)):
         live.update(Y[t], U[t])
         assert same(live.theta, alone.theta[t])
     assert all(same(one.theta, alone.theta) for one in fleet.values())
-    other = Bank(changes(), [Sensor.nominal(R)], reduce=Resample(3, seed=1), p0=2.0)
+    other = Bank(changes, [Sensor.nominal(R)], reduce=Resample(3, seed=1), p0=2.0)
     assert not same(track(Regression(N), other, Y, U).theta, alone.theta)
 
 

@@ -22,7 +22,7 @@ P = [[0.99, 0.01], [0.2, 0.8]]
     ("build", "message"),
     [
         (lambda: Bank([Change(0.0, prob=0.9), Change(0.5, prob=0.2)]), ["sum to 1", "0.9, 0.2"]),
-        (lambda: Bank([Change(0.0), Change(0.5)]), ["only one", "leave prob= open"]),
+        (lambda: Bank([Change(0.0), Change(0.5), Change(9.0, prob=0.1)]), ["only one", "leave prob= open"]),
         (lambda: Bank([]), ["at least one", "()"]),
         (lambda: Bank(TWO, []), ["at least one"]),
         (lambda: Bank([0.5]), ["each a Change"]),

@@ -3,7 +3,7 @@ reported."""
 
 from __future__ import annotations
 
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, timedelta
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ import pytest
 
 from driftfit import ARX, RLS, Kalman, Live, Regression, track
 from driftfit.data.clock import ROUNDED_WITHIN, Clock, median_interval
-from driftfit.data.instants import instant, span
+from driftfit.data.instants import span
 from driftfit.engine.settings import DataWarning
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
@@ -226,15 +226,6 @@ def test_the_best_interval_is_found():
         assert median_interval(pd.date_range("2020-01-01", periods=50, freq=freq).to_numpy())[1] == best
     jitter = np.arange(50) * np.timedelta64(86400, "s") + rng.integers(0, 500, 50).astype("timedelta64[s]")
     assert "business" not in median_interval(np.datetime64("2024-01-01", "s") + jitter)[1]
-
-
-def test_times_of_every_kind_are_one_instant():
-    expected = np.datetime64("2024-03-01T11:00", "us")
-    zoned = datetime(2024, 3, 1, 11, tzinfo=UTC), pd.Timestamp("2024-03-01 12:00", tz="Europe/Paris")
-    for time in (*zoned, datetime(2024, 3, 1, 11), np.datetime64("2024-03-01T11"), "2024-03-01T11:00"):
-        assert instant(time) == expected
-    assert instant(date(2024, 3, 1)) == np.datetime64("2024-03-01")
-    assert instant(np.float32(2.5)) == 2.5
 
 
 PERIODS = {

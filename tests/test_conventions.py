@@ -1,4 +1,4 @@
-"""Conventions that make KFAS and statsmodels look different: the constant of the diffuse likelihood, the place of p0.
+"""Conventions that make KFAS and statsmodels look different: the constant of the diffuse likelihood.
 
 The flow of the Nile at Aswan, 1871 to 1970, in 10^8 m^3 (Cobb, 1978), with the variances of Durbin and Koopman (2012),
 section 2.10.3; log-likelihood and last level as KFAS gives them (Helske, 2017).
@@ -31,24 +31,9 @@ def test_the_published_numbers_of_the_nile(level):
 
 
 def test_statsmodels_counts_the_diffuse_directions(level):
-    local_level(exact_diffuse=True, run=level, constant=0.5 * np.log(2.0 * np.pi))
-
-
-def test_p0_applies_before_the_first_step_of_the_drift():
-    run = track(Regression(0, intercept=True), Kalman(q=Q, r=R, theta0=1000.0, p0=1e4), NILE)
-    gain = (1e4 + Q) / (1e4 + Q + R)
-    assert run.theta[0, 0] == pytest.approx(1000.0 + gain * 120.0)
-    local_level(exact_diffuse=False, run=run, constant=0.0)
-
-
-def local_level(exact_diffuse, run, constant):
-    """statsmodels' local level agrees: its prior is that of the first sample, p0 + q, and its diffuse one has d = 1."""
+    """Its local level agrees; that p0 holds before the first step of the drift is in `test_textbook`."""
     structural = pytest.importorskip("statsmodels.tsa.statespace.structural")
-    model = structural.UnobservedComponents(NILE, "llevel", use_exact_diffuse=exact_diffuse)
-    if not exact_diffuse:
-        model.ssm.initialize_known(np.array([1000.0]), np.array([[1e4 + Q]]))
-        model.ssm.loglikelihood_burn = 0
-    theirs = model.smooth([R, Q])
-    assert theirs.llf == pytest.approx(run.loglik - constant, abs=1e-9)
-    assert theirs.filtered_state[0] == pytest.approx(run.theta[:, 0], rel=1e-10)
-    assert theirs.filtered_state_cov[0, 0] == pytest.approx(run.std[:, 0] ** 2, rel=1e-10)
+    theirs = structural.UnobservedComponents(NILE, "llevel", use_exact_diffuse=True).smooth([R, Q])
+    assert theirs.llf == pytest.approx(level.loglik - 0.5 * np.log(2.0 * np.pi), abs=1e-9)
+    assert theirs.filtered_state[0] == pytest.approx(level.theta[:, 0], rel=1e-10)
+    assert theirs.filtered_state_cov[0, 0] == pytest.approx(level.std[:, 0] ** 2, rel=1e-10)

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from driftfit.data.files import read_columns
 from driftfit.demo import demo
-
-ROOT = demo.resources.files("driftfit")
 
 
 @pytest.fixture(scope="module")
@@ -61,32 +58,6 @@ def test_record_is_complete_and_in_order(record):
     assert np.isfinite(record.u).all()
 
 
-def test_record_is_what_the_series_say(record):
-    data = read_columns(ROOT / "demo" / "us_money_demand.csv", ["m1", "cpi", "realgdp"])
-    assert data["m1"][0] == 139.7
-    assert data["realgdp"][-1] == 12990.341
-    assert np.allclose(np.exp(record.y), data["m1"] / data["cpi"] / (139.7 / 28.98))
-
-
-def test_likelihoods_agree_with_a_textbook_filter(record, found):
-    still = found.still.tracker.settings()
-    assert found.still.loglik == pytest.approx(naive_loglik(record, np.zeros(4), still["r"]), abs=0.05)
-    best = found.run.tracker.settings()
-    assert found.run.loglik == pytest.approx(naive_loglik(record, np.array(best["q"]), best["r"]), abs=0.05)
-
-
-def test_no_other_r_is_more_likely(record, found):
-    settings = found.run.tracker.settings()
-    for factor in (0.9, 1.1):
-        other = demo._run(record, np.array(settings["q"]) * factor, settings["r"] * factor)
-        assert other.loglik < found.run.loglik
-
-
-def test_best_is_inside_the_grid(found):
-    assert found.best[1] not in (demo.RATIOS[0], demo.RATIOS[-1])
-    assert found.run.loglik == max(run.loglik for row in found.runs.values() for run in row.values())
-
-
 def test_sentence_says_what_a_textbook_filter_says(record, found):
     output = re.match(
         r"The coefficient of (\w+) went from ([\d.]+) \(standard error ([\d.]+)\) in (\d+) Q(\d) to ([\d.]+) "
@@ -126,12 +97,6 @@ def test_caveat_says_what_the_searches_say(record, found):
     move = demo.largest_move(found.run.theta[:, demo.INCOME])
     gap = abs(found.run.theta[move.before, demo.INCOME] - found.run.theta[move.after, demo.INCOME])
     assert ("dates overlap" in output) == (gap < half[move.before] + half[move.after])
-
-
-def test_quarters():
-    assert [demo.quarter(t) for t in (1959.0, 1973.25, 2009.5, 1999.75)] == [
-        "1959 Q1", "1973 Q2", "2009 Q3", "1999 Q4",
-    ]  # fmt: skip
 
 
 def shown(picture):

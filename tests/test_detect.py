@@ -7,7 +7,7 @@ import pytest
 from scipy import signal, stats
 from support import arx_record, rows_of
 
-from driftfit import ARX, AugmentedFLS, JointKalman, Kalman, Live, Regression, StateSpace, track
+from driftfit import ARX, JointKalman, Kalman, Live, Regression, StateSpace, track
 from driftfit.judge.alarms.band import normal_limit
 from driftfit.judge.alarms.detect import Alarms, onsets
 from driftfit.run.live.rule import AlarmRule
@@ -183,12 +183,6 @@ def test_wrong_settings(kind, settings, match):
     run = track(ARX(2, 2), K, *arx_record(400, 1))
     with pytest.raises(ValueError, match=match):
         run.detect(kind, **settings)
-
-
-def test_a_tracker_without_covariance_has_no_band():
-    run = track(ARX(2, 2), AugmentedFLS(mu=10.0), *arx_record(400, 1))
-    with pytest.raises(ValueError, match="no covariance"):
-        run.detect("band", reference={run.names[0]: (0.0, 1.0)})
 
 
 def test_the_cause_of_an_alarm_whose_limit_is_zero():

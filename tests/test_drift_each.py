@@ -67,26 +67,6 @@ def test_every_prefix_of_the_filter_and_every_window_is_the_smoother():
     np.testing.assert_array_equal(live.theta, usual.theta[-1])
 
 
-@pytest.mark.parametrize("form", ["covariance", "sqrt"])
-@pytest.mark.parametrize("p0", [None, 0.7])
-def test_kalman_takes_it_for_variances_and_for_a_matrix(form, p0):
-    phi, y, mu = record()
-    drift = of(mu)
-    Q = np.array([[0.4, 0.2], [0.2, 0.3]])
-    for q in ([0.4, 0.3], Q):
-        run = track(TWO, Kalman(q, 0.5, p0=p0, form=form), y, phi, drift=drift)
-        theta, P = np.zeros(2), np.eye(2) * (1e9 if p0 is None else p0)
-        for t in range(40):
-            root = np.diag(np.sqrt(drift[t]))
-            P = P + root @ (np.diag(q) if np.ndim(q) == 1 else q) @ root
-            K = P @ phi[t] / (phi[t] @ P @ phi[t] + 0.5)
-            theta, P = theta + K * (y[t] - phi[t] @ theta), P - np.outer(K, P @ phi[t])
-        np.testing.assert_allclose(run.theta[-1], theta, rtol=1e-6)
-        np.testing.assert_allclose(run.cov(-1), P, rtol=1e-6)
-        np.testing.assert_allclose(run.smooth("cov").theta[-1], run.theta[-1], rtol=1e-9)
-        np.testing.assert_allclose(run.smooth("cov").cov(-1), run.cov(-1), rtol=1e-9)
-
-
 @pytest.mark.parametrize("tracker", [ready(kind) for kind in found().values() if kind.drift_per_parameter], ids=repr)
 def test_every_tracker_that_takes_columns_knows_one_column_for_all(tracker):
     y, u = arx_record(120, 3)
@@ -97,16 +77,6 @@ def test_every_tracker_that_takes_columns_knows_one_column_for_all(tracker):
     a, b = (track(model, tracker, y, u, drift=given) for given in (d, np.repeat(d[:, None], len(names), axis=1)))
     np.testing.assert_allclose(a.theta, b.theta, rtol=1e-7, atol=1e-9)
     assert np.abs(a.theta - plain.theta).max() > 1e-6
-
-
-def test_one_column_for_all_is_the_ordinary_factor():
-    phi, y, _ = record()
-    d = np.random.default_rng(3).uniform(0.0, 4.0, 40)
-    for tracker in (FLS(2.0), Kalman([0.1, 0.0], 0.3, p0=1.0)):
-        a, b = (track(TWO, tracker, y, phi, drift=given) for given in (d, np.column_stack([d, d])))
-        np.testing.assert_allclose(a.theta, b.theta, rtol=1e-12)
-        np.testing.assert_allclose(a.smooth().theta, b.smooth().theta, rtol=1e-12)
-        assert a.loglik == pytest.approx(b.loglik, rel=1e-12)
 
 
 def test_tables_rows_grids_files_and_tuning_carry_it(tmp_path):

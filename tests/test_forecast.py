@@ -67,15 +67,6 @@ def test_bands_of_a_tracker_without_a_noise_variance_grow_from_its_own():
     assert np.all(found.y_std > 0.9 * simple)
 
 
-def test_a_regression_has_no_lags_to_carry_errors():
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=(50, 2))
-    run = track(Regression(2), Kalman(q=1e-3, r=0.1), u @ [1.0, 2.0], u)
-    found = run.forecast(4, np.ones((4, 2)))
-    P = [run.cov(-1) + (k + 1) * 1e-3 * np.eye(2) for k in range(4)]
-    assert np.allclose(found.y_std**2, [p.sum() + 0.1 for p in P])
-
-
 def test_what_is_not_known_is_not_forecast():
     y, u = record(40, 0)
     run = track(ARX(2, 1), Kalman(q=0.0, r=0.09), y[:4], u[:4])  # two samples for three parameters
@@ -86,6 +77,9 @@ def test_what_is_not_known_is_not_forecast():
     found = track(ARX(2, 1), Kalman(q=0.0, r=0.09), y, u).forecast(5, later)
     assert np.isfinite(found.y_std[:3]).all()
     assert np.isnan(found.y_std[3:]).all()
+    for h, inputs, message in ((0, None, "h must be a whole number"), (2, np.ones((2, 2)), "the model has 1 inputs")):
+        with pytest.raises(ValueError, match=message):
+            run.forecast(h, inputs)
 
 
 def test_outputs_that_are_lags_of_each_other():

@@ -167,17 +167,6 @@ def test_names_and_dates_of_a_frame_are_kept(tmp_path):
         track(Regression(intercept=True), TRACKER, newest_first, X.to_numpy())
 
 
-def test_a_time_of_every_kind_is_read():
-    y, X = record()
-    dates = pd.date_range("2024-10-26", periods=T, freq="h", tz="Europe/Berlin")
-    expected = track(NAMED, TRACKER, y, X, time=dates.tz_convert(None).to_numpy(), dt="1h")
-    for time in (dates, pd.Series(dates), pl.Series(list(dates)), list(dates), [d.to_pydatetime() for d in dates]):
-        run = track(NAMED, TRACKER, y, X, time=time, dt="1h")
-        assert np.array_equal(run.theta, expected.theta)
-        assert run.labels.zone == "Europe/Berlin"
-        assert np.array_equal(run.time, expected.time)
-
-
 @pytest.mark.parametrize("model", [NAMED, ARX(1, 1, inputs=["b", "a"], nk=0)])
 def test_a_stream_takes_names(model):
     y, X = record()

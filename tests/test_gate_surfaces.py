@@ -10,7 +10,6 @@ from driftfit import (
     Kalman,
     Live,
     LiveSelection,
-    Outputs,
     Regression,
     Track,
     grid,
@@ -107,15 +106,6 @@ def test_a_gate_is_saved_with_results_and_states(tmp_path):
         Live(PLANT, TRACKER, warm_start=run, gate=True)
     with pytest.raises(ValueError, match="another model, tracker, gate"):
         track(PLANT, TRACKER, y, u, gate=True).program.unpack(run.program.pack(run.program.tile()))
-
-
-def test_every_output_has_a_gate():
-    y, u = plant()
-    other = plant(codes=[100])[0]
-    run = track(ARX(1, 1, ny=2), TRACKER, np.column_stack([y, other]), u, gate=True)
-    assert isinstance(run, Outputs)
-    assert [len(run[name].left_out) for name in run.outputs] == [0, 1]
-    assert (~run.ok[101:]).sum() == 0
 
 
 def test_off_is_said_once_with_the_values_and_the_remedy():

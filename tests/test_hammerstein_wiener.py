@@ -1,4 +1,4 @@
-"""Stage one of Hammerstein-Wiener models: columns, the exact regression, the filter, missing data, bases, warnings."""
+"""Stage one of Hammerstein-Wiener models: columns, the exact regression, missing data, bases, warnings."""
 
 import warnings
 from dataclasses import dataclass
@@ -67,23 +67,6 @@ def rows(model, y, u):
     return np.stack(columns + ([np.ones(T)] if model.intercept else []), axis=1), -g[:, 0]
 
 
-def joseph(phi, z, q, r, p0, theta0):
-    """The textbook filter with the Joseph form, symmetrised; theta (T, n) and P (T, n, n)."""
-    n = phi.shape[1]
-    theta, P = np.full(n, theta0), p0 * np.eye(n)
-    path = []
-    for x, value in zip(phi, z, strict=True):
-        if np.isfinite(x).all():
-            M = P + q * np.eye(n)
-            k = M @ x / (x @ M @ x + r)
-            theta = theta + k * (value - x @ theta)
-            left = np.eye(n) - np.outer(k, x)
-            P = left @ M @ left.T + r * np.outer(k, k)
-            P = 0.5 * (P + P.T)
-        path.append((theta, P))
-    return np.array([t for t, _ in path]), np.array([P for _, P in path])
-
-
 def test_columns_are_those_written_by_hand():
     rng = np.random.default_rng(0)
     y, u = rng.normal(size=(2, 6))
@@ -146,32 +129,6 @@ def test_the_signs_of_the_input_columns_matter():
     phi[:, [2, 3, 6, 7, 8, 9]] *= -1.0
     assert np.abs(phi @ s.theta[3] - z).max() > 0.1
     np.testing.assert_allclose(np.linalg.lstsq(phi, z, rcond=None)[0][2:4], [-0.7, 0.36], atol=1e-9)
-
-
-def test_the_filter_is_the_textbook_filter():
-    """Items 7, 8 and 11: Joseph form, identities (46) and (47), scaling, a scalar prior, least squares."""
-    rng = np.random.default_rng(3)
-    s = simulate(SMALL, [-0.5], [0.5], [0.3], [0.1], T=150, rng=rng, u=rng.uniform(-1.5, 1.5, 150))
-    phi, z = rows(SMALL, s.y, s.u)
-    for p0, tolerance in ((100.0, 1e-9), (1e8, 1e-6)):
-        run = track(SMALL, Kalman(q=10.0, r=0.01, p0=p0, theta0=0.01), s.y, s.u)
-        theta, P = joseph(phi, z, 10.0, 0.01, p0, 0.01)
-        np.testing.assert_allclose(run.theta, theta, rtol=tolerance, atol=tolerance)
-        np.testing.assert_allclose(run.cov(140), P[140], rtol=1e-4, atol=1e-4)
-        root = track(SMALL, Kalman(q=10.0, r=0.01, p0=p0, theta0=0.01, form="sqrt"), s.y, s.u)
-        np.testing.assert_allclose(root.theta, theta, rtol=tolerance, atol=tolerance)
-        assert same(run.cov(100), run.cov(100).T)
-    run = track(SMALL, K, s.y, s.u)
-    x, before, after = phi[50], run.cov(49), run.cov(50)
-    M = before + 1e-5 * np.eye(5)
-    np.testing.assert_allclose(np.linalg.inv(after), np.linalg.inv(M) + np.outer(x, x) / 1e-4, rtol=1e-6)
-    np.testing.assert_allclose(M @ x / (x @ M @ x + 1e-4), after @ x / 1e-4, rtol=1e-7)
-    run = track(SMALL, Kalman(q=10.0, r=0.01, p0=100.0, theta0=0.01), s.y, s.u)
-    scaled = track(SMALL, Kalman(q=73.0, r=0.073, p0=730.0, theta0=0.01), s.y, s.u)
-    np.testing.assert_allclose(scaled.theta, run.theta, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(scaled.std[5:], np.sqrt(7.3) * run.std[5:], rtol=1e-6)
-    theta = track(SMALL, Kalman(q=0.0, r=1e-6, p0=1e8), s.y[:20], s.u[:20]).theta[-1]
-    np.testing.assert_allclose(theta, s.theta[-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("theta0", [0.01, 10.0, 1000.0])

@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from driftfit import identify
 from driftfit.cli import app
+from driftfit.identify import answer
 from driftfit.identify.answer import _Task
-from driftfit.identify.judgement import Move, density, weights
-from driftfit.identify.page import SCHEMA, commands, verb
+from driftfit.identify.judgement import Move, mixed
+from driftfit.identify.page import SCHEMA, SCHEMA_OF_RECORDS, commands, verb
 from driftfit.identify.roles import NoAnswerError, roles
 from driftfit.identify.scores import RIDGE, Scores
 from driftfit.identify.structure import Structure, search
@@ -35,9 +36,9 @@ def plant(change, seed=0):
     """y with one lag, an effect of u1 at delay 6 that is constant, jumps or is bent, one of u2 at once; u3 is idle."""
     rng = np.random.default_rng(seed)
     U, y = rng.normal(size=(T, 3)), np.zeros(T)
-    gain = np.where((np.arange(T) > 450) & (change == "time"), 2.0, 1.0)
+    gain = np.where((np.arange(T) > 450) & (change in ("time", "both")), 2.0, 1.0)
     for t in range(6, T):
-        x = np.abs(U[t - 6, 0]) if change == "working point" else U[t - 6, 0]
+        x = np.abs(U[t - 6, 0]) if change in ("working point", "both") else U[t - 6, 0]
         y[t] = 0.5 * y[t - 1] + gain[t] * x + 0.6 * U[t, 1] + rng.normal()
     return y, U
 
@@ -88,6 +89,8 @@ def test_keys_clocks_that_run_back_and_gaps():
     twice = TABLE | {"clock": ROWS % 150}
     found = roles(twice | {"pump": ["b"] * 150 + ["a"] * 150}, "flow", time="clock")
     assert (found.by, found.groups.max()) == ("pump", 1)
+    states = roles(TABLE | {"clock": ROWS, "state": ["on", "off"] * 150}, "flow")
+    assert (states.by, states.why["state"]) == (None, "text")  # of one plant
     assert roles({"flow": PRESSURE, "name": ["x"] * 300}).output == "flow"  # the only column of numbers
     assert roles(twice, "flow", time="clock").key[-1] == "record 2"
     y, U, place = roles(TABLE | {"clock": ROWS + 3.0 * (ROWS > 100)}, "flow").spread(10)
@@ -122,16 +125,16 @@ def test_scores_are_those_of_a_slow_twin_and_each_added_column_that_of_the_large
     assert np.isneginf(added[:2]).all()
 
 
-@pytest.mark.parametrize("change", ["", "time", "working point"])
+@pytest.mark.parametrize("change", ["", "time", "working point", "both"])
 def test_structure_and_cause(change):
     y, U = plant(change)
     found, late = searched(y, U), searched(y, U, first=1)
-    assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)}) if change != "working point" else True
+    assert (found.na, dict(found.lags)) == (1, {0: (1, 6), 1: (1, 0)})  # also where it is even
     assert all(nk >= 1 and j != 1 for j, (_, nk) in late.lags.items())
     given = Structure(1, {0: (1, 6), 1: (1, 0)})
     phi, made = regressors(y, U), products(y, U, given, ("u1", "u2", "u3"), "y", 0)
     rows = np.isfinite(phi).all(axis=1)
-    assert cause(phi[rows], y[rows], made[0][rows], made[1]).kind(change == "time") == change
+    assert cause(phi[rows], y[rows], made[0][rows], made[1]).kind(change in ("time", "both")) == change
 
 
 def test_the_logarithm_of_the_output_is_compared_on_its_scale():
@@ -155,7 +158,7 @@ def test_the_budget_narrows_the_search_and_what_is_judged():
     short = search(y[:120], U[:120], 30, 0, monotonic() + 9.0, np.random.default_rng(0))
     assert "up to 12 instead of 30" in short.narrowed
     found = identify(pl.read_csv(PUMP).drop("time"), y="flow", budget=0.0)
-    assert "only the last 500 of 800 samples were judged" in str(found)
+    assert "only the last 500 samples of 800 were judged" in str(found)
     assert found.track.time[0] == 300  # rows are counted from the first of the file
 
 
@@ -177,12 +180,14 @@ def test_predictions_some_steps_ahead_and_the_weights_of_a_mixture():
     t = 700
     assert steps_ahead(theta, phi, 1, 1)[t] == pytest.approx(theta[t] @ phi[t])
     assert steps_ahead(theta, phi, 1, 2)[t + 1] == pytest.approx(theta[t] @ [theta[t] @ phi[t], *phi[t + 1, 1:]])
-    early = np.arange(T) < T // 2
-    variance = np.where(early, 0.5, 2.0) ** 2
-    first, second = np.random.default_rng(5).normal(size=(2, T)) * np.sqrt([variance, variance[::-1]])
-    w = weights(-0.5 * (np.log(2.0 * np.pi * variance) + first**2 / variance), density(second))
-    assert np.sqrt(np.mean((w * first + (1.0 - w) * second) ** 2)) < 0.75
-    assert w[:11] == pytest.approx(0.5)
+    size = np.where(np.arange(T) < T // 2, 0.5, 2.0)
+    first, second = np.random.default_rng(5).normal(size=(2, T)) * [size, size[::-1]]
+    both = mixed(y, np.stack([first, second]), 1)
+    assert np.sqrt(np.mean(both[50:] ** 2)) < 0.75
+    late = np.where(np.arange(T) < 150, 3.0, 0.6) * second / size[::-1]  # errors at first do not count for ever
+    assert mixed(y, np.stack([first / size, late]), 1)[-50:] == pytest.approx(late[-50:], abs=0.1)
+    wild = mixed(y, np.stack([first, np.where(t == np.arange(T), 1e4, second)]), 3)  # predictions have bounds
+    assert abs(wild[t]) < 4.0 * np.ptp(y)
 
 
 def test_the_answer_for_a_pump(pump):
@@ -196,27 +201,29 @@ def test_the_answer_for_a_pump(pump):
         assert said in str(pump)
 
 
+KINDS = {"string": str, "object": dict, "array": list, "number": float, "boolean": bool, "null": type(None)}
+
+
+def fits(data, schema):
+    """Whether plain data have a form, by the words of JSON Schema that ours use."""
+    types = schema.get("type", [])
+    assert not types or isinstance(data, tuple(KINDS[one] for one in ([types] if isinstance(types, str) else types)))
+    assert data in schema.get("enum", [data])
+    assert data == schema.get("const", data)
+    if isinstance(data, dict):
+        own, other = schema.get("properties", {}), schema.get("additionalProperties", {})
+        assert set(schema.get("required", [])) <= data.keys()
+        assert all(fits(one, own.get(name, other)) for name, one in data.items())
+    return True
+
+
 def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
-    data, own = pump.json(), SCHEMA["properties"]
-    assert data.keys() == own.keys()
-    assert data["answer"] in own["answer"]["enum"]
-    json.dumps(data, allow_nan=False)
-    kinds = {"string": str, "object": dict, "array": list}
-    typed = {name: kinds[one["type"]] for name, one in own.items() if str(one.get("type")) in kinds}
-    assert {name: type(data[name]) for name in typed} == typed
+    assert fits(json.loads(json.dumps(pump.json(), allow_nan=False)), SCHEMA)
     page = pump.page(tmp_path / "pump.html")
     assert (tmp_path / "pump.html").read_text(encoding="utf-8") == page
-    heads = [
-        "What, since when",
-        "The picture",
-        "How good",
-        "Time or working",
-        "What was chosen",
-        "Problems",
-        "not decide",
-        "To go on",
-    ]
-    assert [page.index(head) for head in heads] == sorted(page.index(head) for head in heads)
+    heads = "What, since when|The picture|How good|Time or working|What was chosen|Problems|not decide|To go on"
+    at = [page.index(head) for head in heads.split("|")]
+    assert at == sorted(at)
 
 
 CODES = {
@@ -225,11 +232,7 @@ CODES = {
     "two outputs": (["--y", "flow,speed"], 2, "it explains one output; call it for flow and for speed"),
     "too few rows": (["--y", "flow", "--limits", "flow=0:11"], 3, "24 rows of 800 have all lags; at least 60"),
     "constant output": (["--y", "pump"], 3, "pump is 1 in all 800 rows"),
-    "no input": (
-        ["--y", "flow", "--not-u", "pressure,speed,temperature,humidity"],
-        0,
-        "no input moves, so only its own",
-    ),
+    "no input": (["--y", "flow", "--not-u", "pressure,speed,temperature,humidity"], 0, "no input moves, so only its"),
     "text": (["--y", "flow", "--u", "time", "--time", "speed"], 3, "time holds text"),
 }
 
@@ -250,18 +253,33 @@ def test_parameters_move_only_if_the_structures_that_came_next_say_so():
     given = Structure(1, {0: (1, 6), 1: (1, 0)}, {0: (6, 6), 1: (0, 0)})
     assert task.judged(found, given).kind == "moves"
     without = replace(given, second=(((1, ((1, 1, 0),)), 0.0, 1.0),))  # u, whose effect moves, is noise to this one
-    assert (
-        "rejected with the chosen structure (p < 0.0001), but not with one of" in task.judged(found, without).headline
-    )
+    assert "the chosen structure (p < 0.0001), but not with one of" in task.judged(found, without).headline
 
 
-def test_records_with_one_structure(tmp_path):
+def test_a_curve_and_a_change_are_both_said():
+    y, U = plant("both")
+    found = identify({"y": y, "u": U[:, 0], "v": U[:, 1]}, y="y")
+    assert (found.kind, [(one.what, 440 <= one.at <= 460) for one in found.moves]) == ("both", [("u", True)])
+    assert "a bend of u" in found.headline.partition("Besides this: ")[0]
+    assert found.headline.partition("Besides this: ")[2].startswith("The curve of u on y")
+
+
+def test_records_with_one_structure(tmp_path, monkeypatch):
     table = pl.read_csv(PUMP).with_columns(
         unit=pl.when(pl.int_range(800) < 400).then(pl.lit("a")).otherwise(pl.lit("b"))
     )
-    found = identify(table, y="flow")
-    assert "records by unit (--by)" in " ".join(str(found).split())
-    assert found.json()["records"].keys() == {"a", "b"}
+    found = identify(table.sort("speed").drop("time"), y="flow", by="unit")  # the rows of both are mixed
+    assert [list(one) for one in (found.track["a"].time[:3], found.track["b"].time[-3:])] == [
+        [0, 1, 2],
+        [397, 398, 399],
+    ]
+    monkeypatch.setattr(answer, "LEAST", 300)
+    found = identify(table, y="flow", budget=0.0)
+    said = " ".join(str(found).split())
+    assert "records by unit (--by)" in said
+    assert "only the last 300 samples of every record were judged (--budget)" in said
+    assert {key: len(run) for key, run in found.track.items()} == {"a": 300, "b": 300}
+    assert fits(json.loads(json.dumps(found.json(), allow_nan=False)), SCHEMA_OF_RECORDS)
     assert found.page(tmp_path / "both.html").index("All records") > 0
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import signal
 from support import arx_record
 
 from driftfit import ARX, RLS, HammersteinWiener, InstrumentalVariables, Live, Regression, track
@@ -78,13 +77,3 @@ def test_the_start_is_forgotten_without_forgetting():
         y = x + 2.0 * rng.normal(size=1500)
         theta.append(track(ARX(2, 2), InstrumentalVariables(1.0), y, u).theta[-1])
     assert np.abs(np.median(theta, axis=0) - [1.5, -0.7, 1.0, 0.5]).max() < 0.08
-
-
-def test_samples_without_weight_leave_no_bias():
-    """Their outputs are no instruments: the noise is coloured."""
-    rng = np.random.default_rng(0)
-    u, v = rng.normal(size=(2, 6000))
-    y = signal.lfilter([0.0, 1.0], [1.0, -0.8], u) + signal.lfilter([1.0, 0.8], [1.0, -0.8], v)
-    weights = np.where(rng.random(6000) < 0.3, 0.0, 1.0)
-    run = track(ARX(1, 1), InstrumentalVariables(0.999), y, u, weights=weights)
-    assert abs(run.theta[3000:, 0].mean() - 0.8) < 0.02

@@ -341,17 +341,6 @@ def test_every_series_may_have_a_reference_of_its_own(fleet):
     assert not result.failed
 
 
-def test_alarms_of_several_outputs():
-    rng = np.random.default_rng(5)
-    u = rng.normal(size=(600, 1))
-    y = u * [1.0, -2.0] + 0.1 * rng.normal(size=(600, 2))
-    y[400:, 1] += 0.5
-    run = track(Regression(1, ny=("level", "flow")), Kalman(q=0.0, r=0.01), y, u)
-    result = run.detect(reference=300)
-    assert result.faulty == ("flow",)
-    assert 400 <= result["flow"].onsets[0] < 450
-
-
 def test_without_faults_few_series_are_accused():
     """p-values of series without a fault are not too small, and not much too large."""
     rng = np.random.default_rng(6)

@@ -50,29 +50,6 @@ def naive_ekf(model, phi, z, q, r, p0, xi, inflation):
     return np.array(path), P
 
 
-@pytest.mark.parametrize("inflation", [0.0, 1.0])
-def test_the_extended_filter_is_its_naive_twin(inflation):
-    s = record(150)
-    start = s.xi[0] + 0.1
-    ekf = ExtendedKalman(q=1e-5, r=1e-4, p0=0.1, theta0=start, inflation=inflation)
-    run = track(SMALL, ekf, s.y, s.u)
-    u, y = s.u, s.y
-    phi = np.full((150, SMALL.n), np.nan)
-    for t in range(2, 150):
-        phi[t] = [y[t - 1], -u[t - 1], -u[t - 2], y[t] ** 2, -(u[t - 1] ** 2), -(u[t - 2] ** 2), y[t - 1] ** 2]
-    path, P = naive_ekf(SMALL, phi, -y, 1e-5, 1e-4, 0.1, start, inflation)
-    assert_allclose(run.theta, path, rtol=1e-8, atol=1e-10)
-    assert_allclose(run.cov(-1), P, rtol=1e-6, atol=1e-12)
-    assert run.names == ("A1", "b1", "b2", "c2", "d2")
-    root = run.prediction[100]
-    xi = run.theta[99]
-    right = -np.delete(phi[100] * SMALL.structure.products(xi), 3).sum()
-    assert root + xi[4] * root**2 == pytest.approx(right, abs=1e-9)
-    found = run.blocks()
-    assert same(found.xi, run.theta)
-    assert_allclose(found.std.c[:, 1], run.std[:, 3])
-
-
 TWO = HammersteinWiener(
     1, [2, 1], nk=[1, 2], input=[Polynomial(2), Polynomial(3)], output=Polynomial(2), intercept=True
 )

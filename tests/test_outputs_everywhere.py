@@ -125,7 +125,7 @@ def test_tables_units_rows_and_grids():
 
 
 def test_trackers_weights_and_drifts_of_their_own():
-    (joint, y, u, _), (shared, z, phi, _) = records()
+    (joint, y, u, _), _ = records()
     w = np.random.default_rng(0).uniform(0.3, 3.0, (80, 2))
     drift = np.random.default_rng(1).uniform(0.0, 2.0, (80, 3))
     each = {"level": Kalman(q=1e-4, r=0.01), "flow": Kalman(q=[0.0, 1e-3, 1e-2], r=0.04)}
@@ -137,16 +137,6 @@ def test_trackers_weights_and_drifts_of_their_own():
     _, high = run.band(0.9)
     np.testing.assert_array_equal(high[:, 1], run["flow"].band(0.9)[1])
     np.testing.assert_array_equal(run.cov(-1)[0], run["level"].cov(-1))
-    sensors = track(shared, Kalman(q=0.01, r=1.0, p0=1.0), z, phi, weights=w)
-    theta, P = np.zeros(2), np.eye(2)
-    for t in range(80):
-        P = P + 0.01 * np.eye(2)
-        seen = np.isfinite(z[t])
-        H, R = phi[t][seen], np.diag(1.0 / w[t][seen])
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-        theta, P = theta + K @ (z[t][seen] - H @ theta), P - K @ H @ P
-        np.testing.assert_allclose(sensors.theta[t], theta, rtol=1e-8)
-    np.testing.assert_allclose(sensors.band()[1][-1], theta + 1.959964 * np.sqrt(np.diag(P)), rtol=1e-6)
     with pytest.raises(ValueError, match=r"weights must be one number, \(80,\) or \(80, 2\)"):
         track(joint, TRACKER, y, u, weights=w[:, :1])
 

@@ -1,9 +1,8 @@
-"""The particle filter: the Kalman filter as its limit, two peaks, random numbers, and the same bits in every mode."""
+"""The particle filter: the Kalman filter as its limit, two peaks, random numbers."""
 
 import numpy as np
 import pytest
 from scipy import stats
-from support import same
 
 from driftfit import JointKalman, Live, ParticleFilter, StateSpace, track
 from driftfit.trackers.state_space.draws import normal
@@ -67,26 +66,6 @@ def test_two_peaks_where_kalman_filters_fail():
     assert size["particles"] < 5.0
     assert size["unscented"] > 7.0
     assert 0.9 < np.mean(inside) < 0.98
-
-
-@pytest.mark.filterwarnings("ignore:.*fault code")
-def test_live_saved_and_in_lanes_it_has_the_bits_of_the_record(tmp_path):
-    y, u, _ = bending(120, 9)
-    y[50:55], y[80], u[90] = np.nan, 1e9, np.nan
-    tracker = ParticleFilter(500, **VARIANCES)
-    run, live = track(BENDING, tracker, y, u), Live(BENDING, tracker)
-    for t in range(120):
-        if t == 60:
-            live.save(tmp_path / "stream")
-            live = Live.load(tmp_path / "stream")
-        step = live.update(y[t], u[t])
-        assert same(live.theta, run.theta[t]), t
-        assert same(step[0], run.prediction[t]), t
-    fleet = track(BENDING, tracker, np.stack([y, y]), np.stack([u, u]), by="row")
-    assert same(fleet[1].theta, run.theta)
-    assert np.isfinite(run.theta).all()
-    other = track(BENDING, ParticleFilter(500, **VARIANCES, seed=1), y, u)
-    assert not same(other.theta, run.theta)
 
 
 def test_random_numbers_are_normal_and_do_not_depend_on_their_neighbours():

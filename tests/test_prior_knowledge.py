@@ -23,39 +23,6 @@ def data(T=150, seed=0):
     return np.sum(theta * u, axis=1) + 0.2 * rng.normal(size=T), u
 
 
-def dense(y, u, dt, drift, kappa=1e7):
-    """The same two laws, written as one dense state space with a wide prior: m1, d1, m2, c, c*, C, C*."""
-    H = np.array([[1, 1, 0, 0, 0, 0, 0], [0, 0, 1, 1, 0, 1, 0]], dtype=float)
-    x, P, found = np.zeros(7), np.diag([kappa, 0.25, *[kappa] * 5]), []
-    for t in range(len(y)):
-        F, Q, keep = np.eye(7), np.zeros(7), np.exp(-dt[t] / 20.0)
-        F[1, 1], Q[1], Q[2], Q[3:] = keep, 0.25 * (1.0 - keep**2), 1e-4 * dt[t], 1e-5 * dt[t]
-        for k in (1, 2):
-            c, s = np.cos(2.0 * np.pi * k * dt[t] / 12), np.sin(2.0 * np.pi * k * dt[t] / 12)
-            F[2 * k + 1 : 2 * k + 3, 2 * k + 1 : 2 * k + 3] = [[c, s], [-s, c]]
-        x, P = F @ x, F @ P @ F.T + np.diag(Q) * drift[t]
-        h = H.T @ u[t]
-        if np.isfinite(y[t]):
-            K = P @ h / (h @ P @ h + 0.04)
-            x, P = x + K * (y[t] - h @ x), (np.eye(7) - np.outer(K, h)) @ P @ (np.eye(7) - np.outer(K, h)).T
-            P += 0.04 * np.outer(K, K)
-        found.append((H @ x, np.sqrt(np.diag(H @ P @ H.T))))
-    return (np.array(part) for part in zip(*found, strict=True))
-
-
-def test_laws_against_a_dense_twin_with_uneven_times_drift_and_missing_outputs():
-    y, u = data()
-    rng = np.random.default_rng(1)
-    dt, drift = rng.choice([1.0, 0.5, 3.0], 150), rng.choice([1.0, 0.0, 20.0], 150)
-    y[rng.random(150) < 0.1] = np.nan
-    dt[0] = 1.0
-    run = track(Regression(2), TRACKER, y, u, time=np.cumsum(dt), dt=1.0, drift=drift)
-    theta, std = dense(y, u, dt, drift)
-    np.testing.assert_allclose(run.theta[15:], theta[15:], atol=1e-5)
-    np.testing.assert_allclose(run.std[15:], std[15:], rtol=1e-5)
-    assert np.isinf(run.std[3]).any()
-
-
 def test_smoothed_laws_are_the_least_squares_of_all_states():
     """Against one dense system for the components of all samples."""
     y, u = data(60)

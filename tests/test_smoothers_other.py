@@ -275,52 +275,8 @@ class TestForecast:
         P = run.cov(-1) + 2 * scale / 10.0 * np.eye(2)
         assert run.forecast(2, phi[:2]).y_std[1] ** 2 == pytest.approx(phi[1] @ P @ phi[1] + scale)
 
-    def test_arx_feeds_on_its_own_forecasts(self):
-        rng = np.random.default_rng(0)
-        u, y = rng.standard_normal(400), np.zeros(400)
-        for t in range(1, 400):
-            y[t] = 0.8 * y[t - 1] + u[t - 1] + 0.1 * rng.standard_normal()
-        run = track(ARX(1, 1), Kalman(q=0.0, r=0.01), y, u)
-        a, b = run.theta[-1]
-        found = run.forecast(6, np.ones(6))
-        expected = [a * y[-1] + b * u[-1]]
-        for _ in range(5):
-            expected.append(a * expected[-1] + b)
-        np.testing.assert_allclose(found.y_hat, expected, rtol=1e-12)
-        noise = 0.1 * np.sqrt(np.cumsum(a ** (2.0 * np.arange(6))))
-        assert (found.y_std >= noise).all()
-        np.testing.assert_allclose(found.y_std, noise, rtol=0.05)
-        assert len(run.theta) == 400
-
-    def test_what_is_not_known_is_not_forecast(self):
-        phi, y = record()
-        found = track(Regression(2), FLS(10.0), y, phi).forecast(2)
-        assert np.isfinite(found.theta).all()
-        assert np.isnan(found.y_hat).all()
-        with pytest.raises(ValueError, match="h must be a whole number"):
-            track(Regression(2), FLS(10.0), y, phi).forecast(0)
-        with pytest.raises(ValueError, match="the model has 2 inputs"):
-            track(Regression(2), FLS(10.0), y, phi).forecast(2, np.ones(2))
-
 
 class TestSquareRoot:
-    @pytest.mark.parametrize("q", [0.1, [0.0, 0.3], [[0.2, 0.05], [0.05, 0.1]]])
-    @pytest.mark.parametrize("p0", [None, 2.0])
-    def test_it_is_the_covariance_form(self, q, p0):
-        phi, y = record()
-        y[[0, 7]] = np.nan
-        phi[:3] = phi[0]
-        rng = np.random.default_rng(1)
-        known = {"weights": rng.uniform(0.0, 2.0, 40), "drift": rng.uniform(0.0, 2.0, 40)}
-        known["weights"][9] = 0.0
-        a = track(Regression(2), Kalman(q, 0.5, p0=p0, theta0=1.0), y, phi, **known)
-        b = track(Regression(2), Kalman(q, 0.5, p0=p0, theta0=1.0, form="sqrt"), y, phi, **known)
-        np.testing.assert_allclose(b.theta, a.theta, rtol=1e-9, atol=1e-10)
-        np.testing.assert_allclose(b.std, a.std, rtol=1e-9)
-        np.testing.assert_allclose(b.innovation_std, a.innovation_std, rtol=1e-9)
-        assert b.loglik == pytest.approx(a.loglik, rel=1e-9)
-        np.testing.assert_allclose(b.smooth().theta, a.smooth().theta, rtol=1e-9, atol=1e-10)
-
     @pytest.mark.parametrize("mu", [1e-12, 1.0, 1e6])
     def test_both_forms_hold_where_a_covariance_would_lose_digits(self, mu):
         """Regressors that differ by 1e-6, against eighty digits."""

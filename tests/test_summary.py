@@ -10,6 +10,7 @@ from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.judge.compare import compare, persistence
+from driftfit.judge.statistics.paired import newey_west, paired
 from driftfit.show.text import WIDTH, digits, printed, table_of, together
 
 K = Kalman(q=1e-3, r=0.1)
@@ -122,14 +123,6 @@ def test_numbers_of_the_summary():
     assert max(map(len, str(summary).splitlines())) <= 96
 
 
-def test_loglik_is_the_sum_over_used_samples():
-    y, u = arx_record(300, 6)
-    y[[50, 100]] = np.nan
-    run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), y, u)
-    expected = stats.norm.logpdf(run.innovation[run.ok], 0.0, run.innovation_std[run.ok]).sum()
-    assert run.loglik == pytest.approx(expected, rel=1e-12)
-
-
 def test_bands_are_normal_quantiles_of_std():
     run = track(ARX(2, 2), K, *arx_record(100, 7))
     for level, half in ((0.95, 1.959963984540054), (0.6826894921370859, 1.0), (0.5, 0.6744897501960817)):
@@ -138,15 +131,6 @@ def test_bands_are_normal_quantiles_of_std():
         assert same(low[5:] + high[5:], 2.0 * run.theta[5:]) or np.allclose(low[5:] + high[5:], 2.0 * run.theta[5:])
     assert np.isinf(low[0]).all()
     assert np.isnan(track(ARX(2, 2), AugmentedFLS(1.0), *arx_record(100, 7)).band()[0]).all()
-
-
-def test_predictions_and_innovations_add_up():
-    y, u = damaged(*arx_record(300, 8))
-    run = track(ARX(2, 2), K, y, u)
-    np.testing.assert_allclose((run.prediction + run.innovation)[run.ok], y[run.ok], rtol=1e-12, atol=1e-12)
-    assert np.isnan(run.innovation[~run.ok]).all()
-    steady = run.ok & np.isfinite(run.innovation_std)
-    assert (run.innovation_std[steady] ** 2 >= 0.1).all()
 
 
 DAYS = np.datetime64("2024-01-01") + np.arange(300) * np.timedelta64(1, "D")
@@ -257,3 +241,39 @@ def test_a_cell_shows_the_band_of_few_residuals():
     run = track(Regression(1), RLS(1.0), [1.0, 2.5, 2.0], [1.0, 2.0, 3.0])
     for end in run.band():
         assert digits(float(end[-1, 0]), float(run.std[-1, 0])) in run._repr_html_()
+
+
+def test_comparison_is_that_of_the_summary():
+    y, u = damaged(*arx_record(400, 5))
+    run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u)
+    result, comparison = run.verdict(), run.summary().comparison
+    rms = {rival.name: rival.rms for rival in result.rivals}
+    assert (result.rms, rms["persistence"], rms["constant LS"], rms["constant ARX"]) == comparison[:4]
+    assert result.scored == comparison.samples
+    assert result.samples == int(run.ok.sum())
+
+
+def test_paired_is_the_textbook_formula():
+    rng = np.random.default_rng(3)
+    own, rival = rng.normal(size=(2, 300))
+    d = rival**2 - own**2
+    centred, lags = d - d.mean(), int(4 * 3 ** (2 / 9))
+    v = np.mean(centred**2) + 2 * sum(
+        (1 - k / (lags + 1)) * np.sum(centred[k:] * centred[:-k]) / 300 for k in range(1, lags + 1)
+    )
+    got = paired("rival", rival, own)
+    assert newey_west(d) == pytest.approx(v, rel=1e-12)
+    assert got.t == pytest.approx(d.mean() / np.sqrt(v / 300), rel=1e-12)
+    assert got.p == pytest.approx(stats.norm.sf(got.t), rel=1e-9)
+    assert got.rms == pytest.approx(np.sqrt(np.mean(rival**2)))
+
+
+def test_paired_where_every_difference_is_the_same_and_in_any_unit():
+    """Persistence on a ramp is wrong by one step at every sample."""
+    better, worse = (
+        paired("persistence", *pair) for pair in ((np.ones(50), np.zeros(50)), (np.zeros(50), np.ones(50)))
+    )
+    assert (better.t, better.p, worse.t, worse.p) == (np.inf, 0.0, -np.inf, 1.0)
+    assert paired("itself", np.ones(50), np.ones(50))[2:] == (0.0, 0.5)
+    own, rival = np.random.default_rng(3).normal(size=(2, 300))
+    assert paired("rival", 1e-90 * rival, 1e-90 * own)[2:] == pytest.approx(paired("rival", rival, own)[2:], rel=1e-9)

@@ -155,25 +155,15 @@ def test_dates_with_and_without_a_zone(kind, zone):
     run.plot()
 
 
-def test_days_and_dates_as_text():
-    y, u = signals()
-    days = [date(2024, 1, 1) + timedelta(days=k) for k in range(T)]
-    by_days = track(
-        MODEL, TRACKER, "y", "u", data=pl.DataFrame({"y": y, "u": u, "t": days}), time="t", dt=timedelta(days=1)
-    )
-    text = pd.DataFrame({"y": y, "u": u, "t": [str(day) for day in days]})
-    by_text = track(MODEL, TRACKER, "y", "u", data=text, time="t", dt=timedelta(days=1))
-    assert_same(by_days, alone(y, u))
-    assert_same(by_text, by_days)
-
-
-def test_dates_that_are_python_objects():
+def test_days_as_objects_and_as_text():
     """What ``column.dt.date`` of pandas and databases give; cells of several zones are instants."""
     y, u = signals()
     days = [date(2024, 1, 1) + timedelta(days=k) for k in range(T)]
     frame = pd.DataFrame({"y": y, "u": u, "t": days})
     assert frame["t"].dtype == object
-    assert_same(track(MODEL, TRACKER, "y", "u", data=frame, time="t", dt="1d"), alone(y, u))
+    for column in (days, [str(day) for day in days]):
+        for table in (frame.assign(t=column), pl.DataFrame({"y": y, "u": u, "t": column})):
+            assert_same(track(MODEL, TRACKER, "y", "u", data=table, time="t", dt="1d"), alone(y, u))
     hours = [datetime(2024, 1, 1, tzinfo=UTC) + timedelta(hours=k) for k in range(T)]
     mixed = [one.astimezone(ZoneInfo("Asia/Tokyo")) if k % 2 else one for k, one in enumerate(hours)]
     several = track(MODEL, TRACKER, "y", "u", data=frame.assign(t=pd.Series(mixed, dtype=object)), time="t", dt="1h")
@@ -240,12 +230,6 @@ def test_weights_drift_and_settings_per_unit():
     fleet = track(MODEL, own, "y", "u", data=table, by="k", weights="w", drift="d")
     assert_same(fleet["a"], alone(y, u, weights=w, drift=d))
     assert_same(fleet["b"], track(MODEL, own["b"], y, u, weights=w, drift=d))
-
-
-def test_a_grid_over_a_table():
-    y, u = signals()
-    grid = track(MODEL, [TRACKER, Kalman(q=1.0, r=0.1)], "y", "u", data=pl.DataFrame({"y": y, "u": u}))
-    assert_same(grid[0], alone(y, u))
 
 
 def test_files_and_patterns(tmp_path):

@@ -243,7 +243,7 @@ CASES = [
 @EIGHT
 @given(data=st.data())
 def test_any_record(tracker, model, data):
-    each = tracker in (kalman, fls)
+    each = tracker in (kalman, kalman_matrix, kalman_root, fls)
     record = data.draw(records(*MODELS[model], each=each))
     compiled, signals = model_of(model, data.draw(st.sampled_from(["drop", "zero"])))
     fast, slow = tracker(data.draw, record)

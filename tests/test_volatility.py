@@ -1,12 +1,14 @@
 """Noise whose variance moves: against a slow twin, and what it is worth."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from driftfit import Kalman, Live, Regression, track, tune
+from driftfit import AdaptiveKalman, Kalman, Live, Regression, track, tune
 
 N = 2
 
@@ -106,6 +108,22 @@ def test_bands_hold_likelihood_gains_and_weights_follow_the_noise():
     assert np.divide(*np.mean(errors, axis=0)) > 1.5
 
 
-def test_what_is_refused():
+def test_the_default_follows_a_variance_that_moves_as_its_stream_does():
+    inside, gain = [], []
+    for seed in range(8):
+        y, u, _ = record(seed, T=400, volatility=0.04)
+        runs = [track(Regression(N), AdaptiveKalman(volatility=v), y, u, gate=False) for v in (None, 0.04)]
+        inside.append(np.abs(runs[1].innovation[50:]) < 1.96 * runs[1].innovation_std[50:])
+        gain.append(runs[1].loglik - runs[0].loglik)
+    live = Live(Regression(N), runs[1].tracker, gate=False)
+    for t in range(len(y)):
+        live.update(y[t], u[t])
+    assert np.array_equal(live.theta, runs[1].theta[-1])
+    assert 0.94 < np.mean(inside) < 0.97
+    assert np.mean(gain) > 20.0
+
+
+@pytest.mark.parametrize("tracker", [partial(Kalman, q=0.0, r=1.0), AdaptiveKalman])
+def test_what_is_refused(tracker):
     with pytest.raises(ValueError, match="volatility"):
-        Kalman(q=0.0, r=1.0, volatility=0.0)
+        tracker(volatility=0.0)

@@ -50,6 +50,7 @@ def watch() -> Violations:
     import llvmlite.binding as llvm
     from llvmlite import ir
     from numba.core import cgutils, config
+    from numba.core.registry import cpu_target
 
     from driftfit.engine import simd
 
@@ -74,22 +75,21 @@ def watch() -> Violations:
         wide = builder.sext(index, i64) if index.type.width < 64 else index
         check(context, builder, builder.icmp_unsigned(">=", wide, size), wide, size)
 
-    def place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
-        inside = context.make_array(kind)(context, builder, array)
-        rows, columns = (builder.extract_value(inside.shape, k) for k in (0, 1))
+    def place(builder: Any, array: Any, row: Any, column: Any) -> Any:
+        rows, columns = (builder.extract_value(array.shape, k) for k in (0, 1))
         at = builder.add(builder.mul(row, columns), column)
         size = builder.mul(rows, columns)
         last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
         beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
-        check(context, builder, beyond, last, size)
-        return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
+        check(cpu_target.target_context, builder, beyond, last, size)
+        return builder.bitcast(builder.gep(array.data, [at]), simd._VECTOR8.as_pointer())
 
     pairs = simd._pair_place
 
-    def pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
-        size = _length(context, builder, kind, array, kind.ndim - 1)
-        check(context, builder, builder.icmp_unsigned(">=", at, size), at, size)
-        return pairs(context, builder, kind, array, at)
+    def pair_place(builder: Any, array: Any, at: Any) -> Any:
+        size = _length(builder, array, array.shape.type.count - 1)
+        check(cpu_target.target_context, builder, builder.icmp_unsigned(">=", at, size), at, size)
+        return pairs(builder, array, at)
 
     for name in settings():  # processes that a test starts have no checks, and must not store their code in this folder
         del os.environ[name]
@@ -99,9 +99,9 @@ def watch() -> Violations:
     return violations
 
 
-def _length(context: Any, builder: Any, kind: Any, array: Any, axes: int) -> Any:
+def _length(builder: Any, array: Any, axes: int) -> Any:
     """The product of the first extents of an array."""
-    shape = context.make_array(kind)(context, builder, array).shape
+    shape = array.shape
     size = builder.extract_value(shape, 0)
     for k in range(1, axes):
         size = builder.mul(size, builder.extract_value(shape, k))

@@ -78,20 +78,6 @@ def test_a_record_without_any_data_leaves_the_start(model, tracker):
     assert run.summary().comparison.samples == 0
 
 
-def test_a_sample_of_weight_0_is_not_used(model, tracker):
-    y, u = arx_record(300, 5)
-    weights = np.ones(300)
-    weights[[100, 101, 200]] = 0.0
-    run = track(model, tracker, y, u, weights=weights)
-    assert np.flatnonzero(~run.ok[2:]).tolist() == [98, 99, 198]
-    assert same(run.theta[101], run.theta[99])
-    y2 = y.copy()
-    y2[100] += 5.0  # its value is still in the lags, so only its own sample may ignore it
-    other = track(model, tracker, y2, u, weights=weights)
-    assert same(other.theta[:101], run.theta[:101])
-    assert same(other.theta[102:], run.theta[102:]) == tracker.output_error  # whose regressors do not hold y
-
-
 def test_a_regressor_that_wakes_up_late(model, tracker):
     """Inputs of zero before every direction was excited: exponential forgetting must not run away meanwhile."""
     y, u = np.zeros((2, 20_000))

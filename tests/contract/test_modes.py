@@ -7,7 +7,6 @@ import pytest
 from support import arx_record, damaged, run_lanes, same
 
 from driftfit import Live, track
-from driftfit.data.record import Known
 
 T = 300
 
@@ -90,19 +89,6 @@ def test_a_lane_says_what_the_record_says(model, tracker):
             assert same(out[name][..., lane], run.written(name)), (lane, name)
 
 
-def test_lanes_do_not_touch_each_other(model, tracker):
-    """One lane of meaningless numbers next to ordinary ones, at other places of the tile: nothing changes."""
-    y, u = arx_record(T, 3)
-    alone = track(model, tracker, y, u)
-    ys, us = (np.repeat(signal[:, None], tracker.width, axis=1) for signal in (y, u))
-    if tracker.width > 1:
-        ys[:, 1], us[::3, 1] = 1e149, np.nan
-    known = Known.of().columns[:, :, None] + 0 * ys[:1]
-    out, _ = run_lanes(model, [tracker] * tracker.width, ys, us[:, None, :], known)
-    for lane in set(range(tracker.width)) - {1}:
-        assert same(out["theta"][..., lane], alone.theta)
-
-
 def test_chunks_do_not_show(model, tracker, monkeypatch):
     y, u = damaged(*arx_record(T, 4))
     whole = track(model, tracker, y, u, **factors(1))
@@ -130,17 +116,6 @@ def test_nothing_looks_ahead(model, tracker, cut):
     assert_same_run(run, track(model, tracker, y[:cut], u[:cut], **{k: v[:cut] for k, v in known.items()}), upto=cut)
 
 
-def test_the_output_of_a_sample_is_not_in_its_own_prediction(model, tracker):
-    y, u = arx_record(T, 7)
-    run = track(model, tracker, y, u)
-    y2 = y.copy()
-    y2[200] += 10.0
-    other = track(model, tracker, y2, u)
-    assert other.prediction[200] == run.prediction[200]
-    assert same(other.innovation_std[200], run.innovation_std[200])
-    assert not same(other.theta[200], run.theta[200])
-
-
 def test_what_was_given_stays_as_it_was(model, tracker):
     y, u = damaged(*arx_record(T, 8))
     given = {"y": y, "u": u, **factors(3)}
@@ -154,17 +129,6 @@ def test_what_was_given_stays_as_it_was(model, tracker):
         live.update(y[t], u[t : t + 1])
     for name, value in given.items():
         assert same(value, before[name]), name
-
-
-def test_inputs_of_other_kinds_give_the_same(model, tracker):
-    y, u = arx_record(T, 9)
-    run = track(model, tracker, y, u)
-    spaced = np.zeros((T, 3))
-    spaced[:, 1] = u
-    assert_same_run(run, track(model, tracker, y.tolist(), u[:, None]))
-    assert_same_run(run, track(model, tracker, y[:, None], spaced[:, 1]))
-    single = y.astype(np.float32)
-    assert_same_run(track(model, tracker, single, u), track(model, tracker, single.astype(float), u))
 
 
 def test_predict_leaves_the_state_alone(model, tracker):

@@ -3,7 +3,6 @@
 After an upgrade of Numba run this file first: `pytest -n 0 tests/contract/test_numba_internals.py`.
 """
 
-import ast
 import gc
 import operator
 import threading
@@ -313,28 +312,6 @@ def test_instructions_on_vectors():
     x = np.arange(16.0).reshape(2, 8)
     Driver(use)(x)
     assert x[1].tolist() == list(range(1, 9)), "llvmlite.ir or Numba's models of primitive types changed."
-
-
-PUBLIC = {"numba", "numba.types", "numba.extending"}
-
-
-def test_one_file_and_one_folder_lean_on_the_inside_of_numba():
-    for path in SRC.rglob("*.py"):
-        used, raw = set(), set()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                used |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                used |= {node.module}
-                raw |= {alias.name for alias in node.names if node.module == "numba"}
-            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "numba":
-                raw.add(node.attr)
-        if path.name == "numba_internals.py" or path.parent.name == "compile_time":
-            continue
-        inside = {name for name in used if name and name.split(".")[0] in {"numba", "llvmlite"}} - PUBLIC
-        assert not inside, f"{path.relative_to(SRC)} imports {inside}; that belongs into engine/numba_internals.py."
-        compilers = raw - {"types", "typeof", "config"}
-        assert not compilers, f"{path.relative_to(SRC)} uses numba.{compilers}; use the decorators of engine.kernel."
 
 
 def test_the_decorators_are_six():

@@ -50,12 +50,12 @@ from driftfit.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.bank.machine.advance import begin, limit_forgetting
 from driftfit.bank.machine.steps import steps_of
 from driftfit.bank.memory import SINGLE, arrays_of, outside, packed
-from driftfit.bank.prior import chains, events, per_sample
-from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
+from driftfit.bank.prior import chains, events, open_prior, per_sample
+from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Resample, Shape
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, covariance, factor, matrix, numbers, vector
+from driftfit.engine.settings import as_numbers, check_numbers, factor, matrix, vector
 from driftfit.models.base import Model
 from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
@@ -71,7 +71,8 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        Changes of theta between samples; the first is the normal course. None: a small drift, and a rare
+        Changes of theta between samples; the first is the normal course. If none has a prob, their probabilities are
+        learned. None: a small drift, and a rare
         jump of any parameter, both scale-free.
     sensors : list of Sensor
         How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance. A spike is
@@ -80,7 +81,8 @@ class Bank(Tracker):
         Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
         sensors). None: events are independent, with the probabilities of the changes and sensors.
     reduce : Reduction
-        How the number of leaves is limited. None: Beam(9), or Hybrid(9) with more than one sensor.
+        How the number of leaves is limited. None: Beam(9), Resample(9) if probabilities are learned, or Hybrid(9) with
+        more than one sensor.
     theta0, p0
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
@@ -121,9 +123,7 @@ class Bank(Tracker):
                 self._set(name, given)
         if self.reduce is not None and not isinstance(self.reduce, Reduction):
             raise ValueError(f"Bank: reduce must be a reduction such as Beam(9) or Decide(3); got {self.reduce!r}.")
-        if self.p0 is not None:
-            self._set("p0", covariance("Bank", "p0", self.p0))
-        self._set("theta0", numbers("Bank", "theta0", self.theta0))
+        check_numbers(self, ("p0",), (), ("theta0",))
         self._set("transition", _tuples(self.transition))
         self._set("initial", _tuples(self.initial))
         self._check()
@@ -170,7 +170,8 @@ class Bank(Tracker):
     @property
     def reduction(self) -> Reduction:
         """How the number of leaves is limited, including the default."""
-        return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
+        one = Resample(9) if self.learns else Beam()
+        return self.reduce or (one if len(self.all_sensors) == 1 else Hybrid())
 
     @property
     def _count(self) -> int:
@@ -183,6 +184,11 @@ class Bank(Tracker):
     @property
     def event_probabilities(self) -> tuple[Array, Array]:
         return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the probabilities of the changes are learned."""
+        return open_prior(self.all_changes, self.transition, len(self.all_sensors))
 
     @property
     def independent(self) -> bool:

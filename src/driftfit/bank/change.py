@@ -15,6 +15,7 @@ Change(forget=lam) is `RLS`, Change(forget=lam, kind="directional") `RLS` with d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,7 +37,8 @@ class Change(Settings):
     size : number, (k,) or None
         Scale-free, instead of q: standard deviation of the change in units of sqrt(r / c_i).
     prob : number or None
-        Prior probability at every sample; None is the remainder of the others.
+        Prior probability at every sample; None is the remainder of the others. If it is None for all of several
+        changes, and there is no transition, they are learned (`driftfit.bank.prior`).
     which : indices or None
         The parameters that change; None is all.
     forget : number in (0, 1]
@@ -103,6 +105,13 @@ class Change(Settings):
                 raise ValueError(f"Change: anchor must be positive definite; got {self.anchor!r}.")
         if self.reset and self.forget != 1.0:
             raise ValueError(f"Change: give forget or reset, not both; got forget={self.forget!r}, reset=True.")
+
+    @classmethod
+    def unknown(cls, drift: float = 0.003, sizes: Sequence[float] = (0.5, 5.0, 50.0, 500.0)) -> tuple[Change, ...]:
+        """Changes of a bank that learns how large jumps are and how often they happen: a scale-free drift, and jumps of
+        sizes that are powers of ten apart.
+        """
+        return cls(size=drift, name="drift"), *(cls(size=size, name=f"jump {size:g}") for size in sizes)
 
     @property
     def forgets(self) -> bool:

@@ -24,6 +24,8 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     transition, initial     Markov chain of the joint events, from row to column; distribution of the first event
     given, given_chain      the user's prior of the joint events at this sample, and the user's chain of the changes
     chain, row              the chain at this sample, and the prior of the events that all leaves have in common
+    counts                  changes that are expected to have happened, before the record and until now; no rows if
+                            their probabilities are given
     loss, reduction, bases  losses of decisions; settings of the reduction; limits of the codes of leaves
     stamps, decided         times of the undecided events; the decisions made at this sample
     components              components of the predictive density (`reducing.lookahead`)
@@ -96,7 +98,7 @@ MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
     "maps_nominal", "places", "fixed_places", "lag_rows", "spare_square",
     "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
-    "new_events", "gap", "path", "chain", "lag_prob", "scratch",
+    "new_events", "gap", "path", "chain", "counts", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
 WHOLE, REPORTED = ("parent", "event", "start", "order", "group", "slots"), ("newest", "decided")

@@ -35,6 +35,8 @@ SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
 ANSWERS = 2
 """Rows for the outputs that a likelihood of the user's own returns, and for all that it returns for one leaf."""
+SAMPLES = 100.0
+"""Samples that the probabilities count for with which a bank that learns them begins."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -83,6 +85,7 @@ def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Arra
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
     transition, initial = bank.event_probabilities
+    counts = np.tile(SAMPLES * initial.reshape(Hd, -1).sum(axis=1), (2 if bank.learns else 0, 1))
     maps, gap = np.array([change.mapping() for change in changes]), np.zeros((Hd, wide + WIDTH))
     gap[0, wide + SINCE] = 1.0
     walks = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
@@ -90,7 +93,7 @@ def _of_changes(bank: Any, n: int, unit: float, theta0: Array) -> dict[str, Arra
         "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
         "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "fixed_places": places,
-        "transition": transition, "chain": transition.copy(), "initial": initial,
+        "transition": transition, "chain": transition.copy(), "initial": initial, "counts": counts,
         "given_chain": np.full(Hd * Hd, np.nan), "gap": gap,
     }  # fmt: skip
 

@@ -1,6 +1,18 @@
 """Prior probabilities of events: independent, or a Markov chain with P[from, to].
 
 The joint event of a change i and a sensor j is e = i H_m + j. The chains are independent a priori: P = kron(P_c, P_s).
+
+Probabilities of changes that are not given are learned. They have a Dirichlet distribution with the mean
+
+    p_i = c_i / sum c,    c_i <- a_i + (1 - 1 / memory) (c_i - a_i) + p(change i at the oldest remembered level | data)
+
+so that c_i is the expected number of changes i, and all leaves have the same prior. A few changes of sizes that are
+powers of ten apart then learn the size, too, as a distribution over these. The sum begins with `memory.SAMPLES`, and
+the expectations are those of the leaves, given all samples since, as many as the reduction remembers. A gap counts as
+many samples.
+
+Source: Smith and Makov (1978), quasi-Bayes; Krishnamurthy and Moore (1993) for counts at a fixed lag; Jilkov and Li
+(2004) for Markov jump systems. Departures: forgetting; the sizes. Cost: O(H^2) per sample.
 """
 
 from __future__ import annotations
@@ -10,15 +22,27 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.bank.change import Change
+from driftfit.bank.change import RARELY, Change
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.kernel import Array
 
 TOLERANCE = 1e-10
 
 
+def open_prior(changes: Sequence[Change], transition: Any, Hm: int) -> bool:
+    """Whether the probabilities of the changes are to be learned: neither they nor a chain of changes are given."""
+    if len(changes) == 1 or any(one.prob is not None for one in changes):
+        return False
+    found = _chains("Bank", transition, len(changes), Hm)
+    return not isinstance(found, np.ndarray) and found[0] is None
+
+
 def shares(owner: str, what: str, given: Sequence[Any]) -> Array:
-    """Prior probabilities (k,) as given; one None is replaced by the remainder."""
+    """Prior probabilities (k,) as given; one None is replaced by the remainder. Changes that are all None are learned,
+    and begin with `RARELY` for all but the first.
+    """
+    if what == "changes" and len(given) > 1 and all(one.prob is None for one in given):
+        return np.asarray([1.0 - RARELY, *[RARELY / (len(given) - 1)] * (len(given) - 1)])
     open_ones = [i for i, one in enumerate(given) if one.prob is None]
     p = np.array([0.0 if one.prob is None else one.prob for one in given])
     if len(open_ones) > 1:

@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import numpy as np
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
+from sklearn.utils.validation import check_array, check_is_fitted, column_or_1d, validate_data
 
 from driftfit.data.arguments import chronological, dated, held
 from driftfit.engine.kernel import Array
@@ -123,14 +123,7 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         if y is None:
             raise ValueError("this TrackedRegressor estimator requires y to be passed, but the target y is None.")
         y = check_array(y, ensure_2d=False, dtype=float, ensure_all_finite="allow-nan", input_name="y")
-        if y.ndim == 2 and y.shape[1] == 1:
-            import warnings
-
-            from sklearn.exceptions import DataConversionWarning
-
-            message = "A column-vector y was passed when a 1d array was expected."
-            warnings.warn(message, DataConversionWarning, stacklevel=3)
-            y = y[:, 0]
+        y = column_or_1d(y, warn=True)
         if y.shape != (len(X),):
             raise ValueError(f"y must be ({len(X)},), one output for each row of X; got shape {y.shape}.")
         if first and not np.isfinite(y).any():

@@ -142,7 +142,7 @@ def _regressors(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     for i in range(model.output_lags or 0):
         if not _same(phi[AT, i], run.y[AT - 1 - i]):
             yield f"output_lags is {model.output_lags}, but regressor {i} is not the output {i + 1} samples before."
-    if model.intercept and not (phi[run.ok, -1] == 1.0).all():
+    if getattr(model, "intercept", False) and not (phi[run.ok, -1] == 1.0).all():
         yield "intercept is declared, but the last regressor is not 1."
     if model.terms is None:
         return

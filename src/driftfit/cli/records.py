@@ -42,7 +42,7 @@ from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
 from driftfit.identify.answer import chosen, identify
-from driftfit.identify.page import Identification, ManyIdentified, interval
+from driftfit.identify.page import interval
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
 from driftfit.judge.structures.select import select as compare
@@ -380,9 +380,7 @@ def identify_command(
     ] = None,
     budget: Annotated[
         float,
-        Option(
-            help="Seconds for one record.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))
-        ),
+        Option(help="Seconds.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))),
     ] = 45.0,
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
     page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
@@ -416,17 +414,11 @@ def identify_command(
             typer.echo(text := f"driftfit: this record cannot answer: {error}", err=True)
             written(document("No answer", [opening([text])]), page)
             raise typer.Exit(3) from None
-    write_answer(found, page, json_to, quiet)
-    raise typer.Exit(found.code)
-
-
-def write_answer(found: Identification | ManyIdentified, page: Path | None, json_to: Path | None, quiet: bool) -> None:
-    """Print the answer, and write what the options ask for."""
-    to_stdout = str(json_to) == "-"
-    if json_to is not None:
-        text = json.dumps(found.json(), indent=1)
-        typer.echo(text) if to_stdout else json_to.write_text(text, encoding="utf-8")
-    if not to_stdout:
-        say(" ".join(found.headline.split()) if quiet else found)
     if page is not None:
         found.page(page)
+    if json_to is not None:
+        text = json.dumps(found.json(), indent=1)
+        typer.echo(text) if str(json_to) == "-" else json_to.write_text(text, encoding="utf-8")
+    if str(json_to) != "-":
+        say(" ".join(found.headline.split()) if quiet else found, soft_wrap=quiet)
+    raise typer.Exit(found.code)

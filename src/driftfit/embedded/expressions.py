@@ -271,7 +271,11 @@ class Expressions:
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
         if hasattr(function, "py_func"):
-            return self.called(function.py_func, arguments, statement)
+            before = self.ops[-1].copy()
+            made = self.called(function.py_func, arguments, statement)
+            if self.unit.ordinary and function.short and not isinstance(function, kernel.Machine):
+                self.ops[-1] = before  # it seldom runs
+            return made
         return self._builtin(node, function, arguments)
 
     def _at_address(self, arguments: list[Value]) -> Value:

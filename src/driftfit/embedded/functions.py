@@ -372,10 +372,12 @@ RESULTS = ("theta", "var")
 
 @dataclass(frozen=True)
 class Translation:
-    """The functions in C, the one that takes a sample, and the record's fields that the structure has."""
+    """The functions in C, the one that takes a sample, the operations of an ordinary sample after the start, and the
+    record's fields that the structure has."""
 
     unit: Unit
     entry: Function
+    ordinary: Counter[str]
     names: tuple[str, ...]
     scratch: tuple[str, ...]
 
@@ -441,8 +443,8 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     flags = frozenset(name for name in constant if _may_be_flag(tile[name][0]))
     scratch = frozenset(program.scratch) & {*fields(tile)}
     while True:
-        unit = Unit(tile, constant, flags, scratch)
-        entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
+        unit, ordinary = (Unit(tile, constant, flags, scratch, ordinary) for ordinary in (False, True))
+        entry, usual = (translate(one, update, [Value("tile"), Value("real", "y"), u]) for one in (unit, ordinary))
         if not (constant & unit.written or flags & unit.beyond):
             break
         constant, flags = constant - unit.written, flags - unit.beyond
@@ -450,7 +452,7 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     read = {*re.findall(r"\bs->(\w+)", text), *factors, *RESULTS}
     names = [name for name in fields(tile) if identifier(name) in read]
     names.sort(key=lambda name: name in flags)  # no gaps: integers last
-    return Translation(unit, entry, tuple(names), tuple(sorted(scratch)))
+    return Translation(unit, entry, usual.operations, tuple(names), tuple(sorted(scratch)))
 
 
 def _may_be_flag(start: Array) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.embedded.functions import Translation, translation
-from driftfit.embedded.values import Unit, as_code, assigned, comment, identifier, number
+from driftfit.embedded.values import as_code, assigned, comment, identifier, number
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES
@@ -105,7 +105,8 @@ def _again(made: Translation, program: Program) -> str:
     return filled(
         "first_samples.c", rows=rows, columns=width, m=max(program.model.m, 1), kept="\n".join(kept),
         restored="\n".join(restored),
-        codes=CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors), entry=made.entry.name,
+        codes=width + CODES, reading=READING, inputs=INPUTS, times=TIMES, factors="\n".join(factors),
+        entry=made.entry.name,
     ).rstrip()  # fmt: skip
 
 
@@ -136,18 +137,9 @@ def _copied(to: str, source: str, size: int) -> str:
 
 def _after_the_start(made: Translation) -> str:
     """The operations of an ordinary sample after the start, if others take more."""
-    ordinary = _counted(_ordinary(made.unit))
+    ordinary = _counted(made.ordinary)
     differs = ordinary != _counted(made.entry.operations)
     return f" An ordinary sample after the start takes at\n  most {ordinary}." if differs else ""
-
-
-def _ordinary(unit: Unit) -> Counter[str]:
-    """Operations of an ordinary sample after the start: those of routines that only others call are left out."""
-    operations = {function.name: function.operations for function in unit.functions.values()}
-    if "advance" not in operations:
-        return operations["sample"]
-    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
-    return sum(parts, Counter[str]()) - operations.get("late", Counter())
 
 
 def _counted(ops: Counter[str]) -> str:

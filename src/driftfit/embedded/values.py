@@ -210,8 +210,13 @@ class Function:
 class Unit:
     """The shared state of the functions of one file."""
 
-    def __init__(self, record: Array, constant: frozenset[str], flags: frozenset[str], scratch: frozenset[str]) -> None:
+    def __init__(
+        self, record: Array, constant: frozenset[str], flags: frozenset[str], scratch: frozenset[str],
+        ordinary: bool = False,
+    ) -> None:  # fmt: skip
         self.record, self.scratch = record, scratch
+        self.ordinary = ordinary
+        """Whether only the operations of an ordinary sample are counted."""
         self.constant = constant
         """Fields that are assumed to keep the values that they start with."""
         self.flags = flags

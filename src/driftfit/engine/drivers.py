@@ -274,7 +274,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: A
         done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
         return done
 
-    return Drivers(checked, *_updates(sample))
+    return Drivers(checked, _updating(sample, False), _updating(sample, True))
 
 
 GATED = ("reason", "raw_e")
@@ -402,29 +402,23 @@ def _run(sample: Any, read_extra: Any, write: Any, part: Any, judged: bool) -> D
     return run
 
 
-def _updates(sample: Any) -> tuple[Driver, Driver]:
-    """One sample of a stream, with an array of inputs and with a single one."""
+def _updating(sample: Any, single: bool) -> Driver:
+    """One sample of a stream, with an array of inputs or with a single one."""
 
     @Driver
-    def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
+    def update(tile: Array, y: float, u: Any) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
         s.dt[0] = s.interval[0]
-        for j in range(u.shape[0]):
-            s.u[j, 0] = u[j]
+        if single:  # a constant
+            s.u[0, 0] = u
+        else:
+            for j in range(u.shape[0]):
+                s.u[j, 0] = u[j]
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    @Driver
-    def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
-        s = tile[0]
-        s.y[0] = y
-        s.dt[0] = s.interval[0]
-        s.u[0, 0] = u
-        sample(s)
-        return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
-
-    return update, update_one
+    return update
 
 
 def _check_shapes(m: int, L: int, T: int, y: Array, u: Array, known: Array) -> None:

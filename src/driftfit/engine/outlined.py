@@ -52,7 +52,7 @@ def outlined(step: Any, short: bool = False, lanes: Any = None) -> Any:
         return types.none(record), build
 
     made = internals.named_intrinsic(f"outlined.{step.identity}.{lanes.identity}", typed)
-    made.py_func = step.py_func
+    made.py_func, made.short = step.py_func, short
     return made
 
 

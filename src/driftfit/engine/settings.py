@@ -117,6 +117,22 @@ def covariance(owner: str, name: str, value: Any) -> Any:
     return checked
 
 
+def check_numbers(
+    of: Settings, covariances: Sequence[str] = (), positive: Sequence[str] = (), values: Sequence[str] = ()
+) -> None:
+    """Check and normalise settings: covariances, positive numbers, and numbers; None is accepted as a default."""
+    kind = type(of)
+    for name in (*covariances, *positive, *values):
+        value = getattr(of, name)
+        if value is None and getattr(kind, name) is None:
+            continue
+        if name in covariances:
+            of._set(name, covariance(kind.__name__, name, value))
+        else:
+            rule = {"ndim": 0, "low": 0.0, "strict": True} if name in positive else {}
+            of._set(name, numbers(kind.__name__, name, value, **rule))  # type: ignore[arg-type]
+
+
 def vector(owner: str, name: str, value: Any, n: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Spread a number over n entries, or check that a sequence has n of them."""
     array = np.asarray(value, dtype=float)

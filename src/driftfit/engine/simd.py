@@ -12,6 +12,8 @@ as those of single numbers. Indices count from the front and are not checked.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from inspect import Parameter, Signature
 from typing import Any
 
 from numba import types
@@ -53,260 +55,186 @@ class _Model2(models.PrimitiveModel):
 
 
 vector8, vector2 = Vector8(), Vector2()
+SAME = None
+"""The type of an argument, or of the result, that is that of what is given, or of the first argument."""
 
 
-def _named(name: str, build: Any) -> Any:
-    """An operation that Numba compiles under the same name in every process."""
-    return named_intrinsic(f"simd.{name}", build)
+def _operation(name: str, result: Any, kinds: tuple[Any, ...], build: Callable[..., Any]) -> Any:
+    """An operation that Numba compiles under the same name in every process; ``build(builder, *given)`` writes it."""
+
+    def typed(context: Any, *given: Any) -> Any:
+        taken = [own if kind is SAME else kind for kind, own in zip(kinds, given, strict=True)]
+
+        def write(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            opened = [
+                context.make_array(kind)(context, builder, value) if isinstance(kind, types.Array) else value
+                for kind, value in zip(taken, values, strict=True)
+            ]
+            made = build(builder, *opened)
+            return context.get_dummy_value() if result is types.void else made
+
+        return (taken[0] if result is SAME else result)(*taken), write
+
+    positions = [Parameter(f"given{k}", Parameter.POSITIONAL_ONLY) for k in range(1 + len(kinds))]
+    typed.__signature__ = Signature(positions)  # type: ignore[attr-defined]  # Numba wants one without a star
+    return named_intrinsic(f"simd.{name}", typed)
 
 
-def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
-    """The address of entry [row, column]."""
-    inside = context.make_array(kind)(context, builder, array)
-    columns = builder.extract_value(inside.shape, 1)
-    first = builder.gep(inside.data, [builder.add(builder.mul(row, columns), column)])
+def _place(builder: Any, array: Any, row: Any, column: Any) -> Any:
+    """The address of the vector that begins at entry [row, column]."""
+    columns = builder.extract_value(array.shape, 1)
+    first = builder.gep(array.data, [builder.add(builder.mul(row, columns), column)])
     return builder.bitcast(first, _VECTOR8.as_pointer())
 
 
-def _load(context: Any, array: Any, row: Any, column: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.load(_place(context, builder, signature.args[0], *given), align=8)
-
-    return vector8(array, types.intp, types.intp), build
-
-
-def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        builder.store(given[3], _place(context, builder, signature.args[0], *given[:3]), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, vector8), build
-
-
-def _fill(context: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _spread(builder, given[0], _VECTOR8)
-
-    return vector8(types.float64), build
-
-
-def _pair_place(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:
+def _pair_place(builder: Any, array: Any, at: Any) -> Any:
     """The address of pair ``at`` of an array, counted over all its axes but the last."""
-    inside = context.make_array(kind)(context, builder, array)
-    first = builder.gep(inside.data, [builder.shl(at, ir.Constant(_I64, 1))])
-    return builder.bitcast(first, _VECTOR2.as_pointer())
+    return builder.bitcast(builder.gep(array.data, [builder.shl(at, _I64(1))]), _VECTOR2.as_pointer())
 
 
-def _pair(context: Any, array: Any, at: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.load(_pair_place(context, builder, signature.args[0], *given), align=8)
-
-    return vector2(array, types.intp), build
+def _load(builder: Any, place: Any) -> Any:
+    return builder.load(place, align=8)
 
 
-def _put_pair(context: Any, array: Any, at: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        builder.store(given[2], _pair_place(context, builder, signature.args[0], *given[:2]), align=8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector2), build
+def _wholes(builder: Any, array: Any, at: Any) -> Any:
+    """Entries [at] to [at + 7] of whole numbers."""
+    return _load(builder, builder.bitcast(builder.gep(array.data, [at]), _WHOLE.as_pointer()))
 
 
-def _assembled(builder: Any, entries: Any, kind: Any) -> Any:
-    made = ir.Constant(kind, ir.Undefined)
-    for k, entry in enumerate(entries):
-        made = builder.insert_element(made, entry, ir.Constant(_I32, k))
-    return made
+def _two_of(builder: Any, first: Any, second: Any) -> Any:
+    made = builder.insert_element(ir.Constant(_VECTOR2, ir.Undefined), first, _I32(0))
+    return builder.insert_element(made, second, _I32(1))
 
 
-def _two_of(context: Any, first: Any, second: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _assembled(builder, given, _VECTOR2)
-
-    return vector2(types.float64, types.float64), build
-
-
-def _one_of(context: Any, vector: Any, k: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.extract_element(given[0], builder.trunc(given[1], ir.IntType(32)))
-
-    return types.float64(vector, types.intp), build
-
-
-def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        where = context.make_array(signature.args[2])(context, builder, given[2])
-        indices = builder.bitcast(builder.gep(where.data, [given[3]]), _WHOLE.as_pointer())
-        first = _place(context, builder, signature.args[0], given[0], given[1], ir.Constant(_I64, 0))
-        start = _spread(builder, builder.ptrtoint(first, _I64), _WHOLE)
-        bytes_ = builder.shl(builder.load(indices, align=8), ir.Constant(_WHOLE, [3] * WIDTH))
-        kind = ir.VectorType(ir.DoubleType().as_pointer(), WIDTH)
-        name, mask = "llvm.masked.gather.v8f64.v8p0", ir.Constant(ir.VectorType(ir.IntType(1), WIDTH), [1] * WIDTH)
-        given_by = ir.FunctionType(_VECTOR8, [kind, ir.IntType(32), mask.type, _VECTOR8])
-        gather = builder.module.globals.get(name) or ir.Function(builder.module, given_by, name)
-        places = builder.inttoptr(builder.add(start, bytes_), kind)
-        return builder.call(gather, [places, ir.Constant(ir.IntType(32), 8), mask, ir.Constant(_VECTOR8, ir.Undefined)])
-
-    return vector8(array, types.intp, order, types.intp), build
+def _all(kind: Any, number: Any) -> Any:
+    """The constant vector of one number."""
+    return ir.Constant(kind, [number] * kind.count)
 
 
 def _spread(builder: Any, value: Any, kind: Any) -> Any:
     """A vector with one number in all places."""
-    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
-    return builder.shuffle_vector(one, one, everywhere)
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, _I32(0))
+    return builder.shuffle_vector(one, one, _all(ir.VectorType(_I32, kind.count), 0))
 
 
-def _compare(sign: str) -> Any:
-    def typed(context: Any, array: Any, at: Any, value: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            inside = context.make_array(signature.args[0])(context, builder, given[0])
-            first = builder.bitcast(builder.gep(inside.data, [given[1]]), _WHOLE.as_pointer())
-            other = _spread(builder, given[2], _WHOLE)
-            return _one_where(builder, builder.icmp_signed(sign, builder.load(first, align=8), other))
+def _called(builder: Any, name: str, kinds: list[Any], *given: Any) -> Any:
+    """What an instruction of LLVM with a name makes of vectors."""
+    kind = ir.FunctionType(_VECTOR8, kinds)
+    return builder.call(builder.module.globals.get(name) or ir.Function(builder.module, kind, name), given)
 
-        return vector8(array, types.intp, types.intp), build
 
-    return typed
+def _gather(builder: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
+    start = _spread(builder, builder.ptrtoint(_place(builder, array, row, _I64(0)), _I64), _WHOLE)
+    bytes_ = builder.shl(_wholes(builder, order, k), _all(_WHOLE, 3))
+    kind, mask = ir.VectorType(ir.DoubleType().as_pointer(), WIDTH), _all(ir.VectorType(ir.IntType(1), WIDTH), 1)
+    places, none = builder.inttoptr(builder.add(start, bytes_), kind), ir.Constant(_VECTOR8, ir.Undefined)
+    kinds = [kind, _I32, mask.type, _VECTOR8]
+    return _called(builder, "llvm.masked.gather.v8f64.v8p0", kinds, places, _I32(8), mask, none)
 
 
 def _one_where(builder: Any, true: Any) -> Any:
-    one, zero = (ir.Constant(_VECTOR8, [x] * WIDTH) for x in (1.0, 0.0))
-    return builder.select(true, one, zero)
+    return builder.select(true, _all(_VECTOR8, 1.0), _all(_VECTOR8, 0.0))
 
 
-def _pick(sign: str) -> Any:
-    def typed(context: Any, a: Any, b: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return builder.select(builder.fcmp_ordered(sign, *given), *given)
+def _compare(sign: str) -> Callable[..., Any]:
+    def build(builder: Any, array: Any, at: Any, value: Any) -> Any:
+        given = _wholes(builder, array, at), _spread(builder, value, _WHOLE)
+        return _one_where(builder, builder.icmp_signed(sign, *given))
 
-        return a(a, a), build
-
-    return typed
+    return build
 
 
-def _only(context: Any, a: Any, b: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        zero = ir.Constant(given[0].type, [0.0] * given[0].type.count)
-        return builder.select(builder.fcmp_ordered(">", given[1], zero), given[0], zero)
-
-    return a(a, a), build
+def _pick(sign: str) -> Callable[..., Any]:
+    return lambda builder, a, b: builder.select(builder.fcmp_ordered(sign, a, b), a, b)
 
 
-def _power_of_two(context: Any, a: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        whole = builder.add(builder.fptosi(given[0], _WHOLE), ir.Constant(_WHOLE, [1023] * WIDTH))
-        return builder.bitcast(builder.shl(whole, ir.Constant(_WHOLE, [52] * WIDTH)), _VECTOR8)
-
-    return vector8(vector8), build
+def _only(builder: Any, a: Any, b: Any) -> Any:
+    zero = _all(a.type, 0.0)
+    return builder.select(builder.fcmp_ordered(">", b, zero), a, zero)
 
 
-def _exponent_of(context: Any, a: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        shifted = builder.ashr(builder.bitcast(given[0], _WHOLE), ir.Constant(_WHOLE, [52] * WIDTH))
-        return builder.sitofp(builder.sub(shifted, ir.Constant(_WHOLE, [1023] * WIDTH)), _VECTOR8)
-
-    return vector8(vector8), build
+def _power_of_two(builder: Any, a: Any) -> Any:
+    whole = builder.add(builder.fptosi(a, _WHOLE), _all(_WHOLE, 1023))
+    return builder.bitcast(builder.shl(whole, _all(_WHOLE, 52)), _VECTOR8)
 
 
-def _mantissa_of(context: Any, a: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        digits = builder.and_(builder.bitcast(given[0], _WHOLE), ir.Constant(_WHOLE, [0xFFFFFFFFFFFFF] * WIDTH))
-        return builder.bitcast(builder.or_(digits, ir.Constant(_WHOLE, [0x3FF0000000000000] * WIDTH)), _VECTOR8)
-
-    return vector8(vector8), build
+def _exponent_of(builder: Any, a: Any) -> Any:
+    shifted = builder.ashr(builder.bitcast(a, _WHOLE), _all(_WHOLE, 52))
+    return builder.sitofp(builder.sub(shifted, _all(_WHOLE, 1023)), _VECTOR8)
 
 
-def _two(operation: str) -> Any:
-    def typed(context: Any, a: Any, b: Any) -> Any:
-        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            return getattr(builder, operation)(*given)
-
-        return a(a, a), build
-
-    return typed
+def _mantissa_of(builder: Any, a: Any) -> Any:
+    digits = builder.and_(builder.bitcast(a, _WHOLE), _all(_WHOLE, 0xFFFFFFFFFFFFF))
+    return builder.bitcast(builder.or_(digits, _all(_WHOLE, 0x3FF0000000000000)), _VECTOR8)
 
 
-def _root(context: Any, a: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        name = "llvm.sqrt.v8f64"
-        kind = ir.FunctionType(_VECTOR8, [_VECTOR8])
-        return builder.call(builder.module.globals.get(name) or ir.Function(builder.module, kind, name), given)
-
-    return vector8(vector8), build
-
-
-def _reaches(context: Any, a: Any, b: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _one_where(builder, builder.fcmp_ordered(">=", *given))
-
-    return vector8(vector8, vector8), build
+def _sum(builder: Any, value: Any) -> Any:
+    parts = [builder.extract_element(value, _I32(k)) for k in range(WIDTH)]
+    while len(parts) > 1:
+        half = len(parts) // 2
+        parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
+    return parts[0]
 
 
-def _sum(context: Any, value: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        parts = [builder.extract_element(given[0], ir.Constant(ir.IntType(32), k)) for k in range(WIDTH)]
-        while len(parts) > 1:
-            half = len(parts) // 2
-            parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
-        return parts[0]
-
-    return types.float64(vector8), build
-
-
-def _sums(context: Any, array: Any, row: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        rows = [builder.add(given[1], ir.Constant(_I64, k)) for k in range(WIDTH)]
-        zero = ir.Constant(_I64, 0)
-        places = [_place(context, builder, signature.args[0], given[0], row, zero) for row in rows]
-        parts = [builder.load(place, align=8) for place in places]
-        for step in (1, 2, 4):  # entries, then pairs, then fours: sums of two rows go into one vector
-            even = [
-                k // (2 * step) * 2 * step + k % step + (WIDTH if k % (2 * step) >= step else 0) for k in range(WIDTH)
-            ]
-            first, second = (
-                ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [k + more for k in even]) for more in (0, step)
-            )
-            pairs = zip(parts[::2], parts[1::2], strict=True)
-            parts = [
-                builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second))
-                for a, b in pairs
-            ]
-        return parts[0]
-
-    return vector8(array, types.intp), build
+def _sums(builder: Any, array: Any, row: Any) -> Any:
+    rows = [builder.add(row, _I64(k)) for k in range(WIDTH)]
+    parts = [_load(builder, _place(builder, array, one, _I64(0))) for one in rows]
+    for step in (1, 2, 4):  # entries, then pairs, then fours: sums of two rows go into one vector
+        even = [k // (2 * step) * 2 * step + k % step + (WIDTH if k % (2 * step) >= step else 0) for k in range(WIDTH)]
+        first, second = (ir.Constant(ir.VectorType(_I32, WIDTH), [k + more for k in even]) for more in (0, step))
+        pairs = zip(parts[::2], parts[1::2], strict=True)
+        parts = [
+            builder.fadd(builder.shuffle_vector(a, b, first), builder.shuffle_vector(a, b, second)) for a, b in pairs
+        ]
+    return parts[0]
 
 
-load = _named("load", _load)
+PLACE, ONE, TWO = (SAME, types.intp, types.intp), (vector8,), (SAME, SAME)
+load = _operation("load", vector8, PLACE, lambda builder, *at: _load(builder, _place(builder, *at)))
 """Entries [row, column] to [row, column + 7] of a matrix."""
-store = _named("store", _store)
-"""Write a vector there."""
-fill = _named("fill", _fill)
-"""A vector of one number, eight times."""
-plus, minus, times, over = (
-    _named(name, _two(operation))
-    for name, operation in (("plus", "fadd"), ("minus", "fsub"), ("times", "fmul"), ("over", "fdiv"))
+store = _operation(
+    "store", types.void, (*PLACE, vector8), lambda builder, *at: builder.store(at[3], _place(builder, *at[:3]), align=8)
 )
-root = _named("root", _root)
+"""Write a vector there."""
+fill = _operation("fill", vector8, (types.float64,), lambda builder, value: _spread(builder, value, _VECTOR8))
+"""A vector of one number, eight times."""
+plus = _operation("plus", SAME, TWO, lambda builder, a, b: builder.fadd(a, b))
+minus = _operation("minus", SAME, TWO, lambda builder, a, b: builder.fsub(a, b))
+times = _operation("times", SAME, TWO, lambda builder, a, b: builder.fmul(a, b))
+over = _operation("over", SAME, TWO, lambda builder, a, b: builder.fdiv(a, b))
+root = _operation("root", vector8, ONE, lambda builder, a: _called(builder, "llvm.sqrt.v8f64", [_VECTOR8], a))
 """Square roots of the entries."""
-reaches = _named("reaches", _reaches)
+reaches = _operation(
+    "reaches", vector8, (vector8, vector8), lambda builder, a, b: _one_where(builder, builder.fcmp_ordered(">=", a, b))
+)
 """1 where the first is at least the second, 0 elsewhere."""
-equal, below = _named("equal", _compare("==")), _named("below", _compare("<"))
+equal, below = (_operation(name, vector8, PLACE, _compare(sign)) for name, sign in (("equal", "=="), ("below", "<")))
 """1 where entries [at] to [at + 7] of whole numbers are a value, or below it, 0 elsewhere."""
-gathered = _named("gathered", _gather)
+gathered = _operation("gathered", vector8, (SAME, types.intp, SAME, types.intp), _gather)
 """Entries [row, order[k]] to [row, order[k + 7]] of a matrix."""
-pair, put_pair = _named("pair", _pair), _named("put_pair", _put_pair)
-"""Pair ``at`` of an array whose last axis is 2, counted over its other axes; and write it there."""
-two, entry = _named("two", _two_of), _named("entry", _one_of)
-"""A pair of two numbers; and entry k of a pair."""
-sum_of = _named("sum_of", _sum)
+pair = _operation("pair", vector2, (SAME, types.intp), lambda builder, *at: _load(builder, _pair_place(builder, *at)))
+"""Pair ``at`` of an array whose last axis is 2, counted over its other axes."""
+put_pair = _operation(
+    "put_pair", types.void, (SAME, types.intp, vector2),
+    lambda builder, array, at, value: builder.store(value, _pair_place(builder, array, at), align=8),
+)  # fmt: skip
+"""Write it there."""
+two = _operation("two", vector2, (types.float64, types.float64), _two_of)
+"""A pair of two numbers."""
+entry = _operation(
+    "entry", types.float64, (SAME, types.intp), lambda builder, a, k: builder.extract_element(a, builder.trunc(k, _I32))
+)
+"""Entry k of a pair."""
+sum_of = _operation("sum_of", types.float64, ONE, _sum)
 """The sum of the eight entries, added in pairs."""
-lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))
+lower, higher = (_operation(name, SAME, TWO, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))
 """The smaller, or the larger, of two entries; the second where one is not a number."""
-only = _named("only", _only)
+only = _operation("only", SAME, TWO, _only)
 """The first where the second is positive, 0 elsewhere."""
-_power, _exponent, _mantissa = (_named(f.__name__, f) for f in (_power_of_two, _exponent_of, _mantissa_of))
-row_sums = _named("row_sums", _sums)
+_power, _exponent, _mantissa = (
+    _operation(f.__name__, vector8, ONE, f) for f in (_power_of_two, _exponent_of, _mantissa_of)
+)
+row_sums = _operation("row_sums", vector8, (SAME, types.intp), _sums)
 """Of the first eight entries of each of the rows row to row + 7: less than a third of the work of eight `sum_of`."""
 
 

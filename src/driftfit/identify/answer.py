@@ -8,6 +8,7 @@ columns of lags, O(T p^2) for the search, and that of up to four verdicts.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import monotonic
@@ -18,12 +19,12 @@ import numpy as np
 from driftfit.data.columns import Wanted
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.identify.judgement import effects, errors_of, feedback, moves
+from driftfit.identify.judgement import effects, errors_of, feedback, moves, with_lags
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
-from driftfit.identify.roles import NoAnswerError, Roles, roles
-from driftfit.identify.scores import FEWEST
+from driftfit.identify.roles import BACK, Roles, roles
 from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
+from driftfit.judge.changes.words import events
 from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
 from driftfit.judge.verdict import Verdict, judged, p_equals
 from driftfit.models.arx import ARX
@@ -33,7 +34,7 @@ from driftfit.tracking import track
 
 LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
-RATE, LEAST = 1000.0, 500
+RATE, LEAST = 50_000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
 WORST = 3
 """Records of a fleet that have a page."""
@@ -51,14 +52,11 @@ def identify(
     Parameters
     ----------
     data : table, mapping of columns, path, pattern or list of paths
-    y : name of the output
-        It may be left out if only one column of numbers is left.
-    u, not_u : names
-        The inputs to choose from, and columns that are none. By default every other column of numbers.
-    time, by : names
-        The column of the time, and the one that identifies records; found if not given.
-    dt : number or text
-        Nominal interval, as for `track`; the median by default.
+    y, u, not_u : names
+        The output, which may be left out if only one column of numbers is left; the inputs to choose from, by default
+        every other column of numbers; columns that are none.
+    time, dt, by : names, number or text
+        The column of the time, its nominal interval, the column that identifies records; found if not given.
     limits : mapping from columns to (low, high)
         Valid ranges; what is outside is missing.
     max_lag, horizon : int
@@ -70,8 +68,8 @@ def identify(
     gate : bool or None
         As for `track`. None: that of the default tracker, and no answer if more than `LEFT_OUT` of the readings go.
     budget : number
-        Seconds for one record. The search stops after a third of them; then as many of the last samples are judged as
-        are expected to take what is left. For several records it is that of the search.
+        Seconds. The search stops after a third of them; then as many of the last samples of every record are judged as
+        are expected to take what is left, but at least `LEAST`.
     seed, progress : int, callable
         Seed of the displaced copies of inputs; told what is being done.
     reading : Wanted or None
@@ -82,7 +80,7 @@ def identify(
     ValueError
         For columns that do not exist, an output that is not named and not obvious, and what `track` does not accept.
     driftfit.identify.roles.NoAnswerError
-        For a record that cannot answer: fewer than `FEWEST` rows with all lags, a constant output, text.
+        For a record that cannot answer: fewer than 60 rows with all lags, a constant output, text.
     """
     end = monotonic() + budget
     max_lag, horizon = whole("identify", "max_lag", max_lag, 1), whole("identify", "horizon", horizon, 1)
@@ -91,35 +89,27 @@ def identify(
     progress("reading")
     found = roles(data, y, u=u, not_u=not_u, time=time, dt=dt, by=by, limits=limits, codes=gate is not False,
                   wanted=reading)  # fmt: skip
-    check_record(found)
-    source = str(data) if isinstance(data, str) or hasattr(data, "__fspath__") else "data.csv"
+    paths = [data] if isinstance(data, str) or hasattr(data, "__fspath__") else data if isinstance(data, list) else []
+    source = tuple(map(str, paths)) or ("data.csv",)
     task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
     structure = task.structure(found, max_lag)
+    model = model_of(found, structure.shape)
+    found, structure = task.affordable(found, structure, model.n)
     if found.by is None:
         return task.judged(found, structure)
     progress("tracking")
-    model = model_of(found, structure.shape)
     fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
-    verdicts, worst = fleet.verdict(level), {}
+    verdicts, worst, by = fleet.verdict(level), {}, "" if found.by == BACK else f" --by {shlex.quote(found.by)}"
     for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
         at = np.flatnonzero([one == key for one in found.key])
-        worst[key] = task.judged(replace(found.rows(at), by=None), structure)
-    return ManyIdentified(model, fleet, verdicts, worst, found)
-
-
-def check_record(found: Roles) -> None:
-    """NoAnswerError for a record that no structure can answer."""
-    known = found.y[np.isfinite(found.y)]
-    if len(known) < FEWEST:
-        raise NoAnswerError(f"{len(known)} of {len(found.y)} rows hold {found.output}; at least {FEWEST} are needed.")
-    if np.ptp(known) <= 1e-12 * np.max(np.abs(known)):
-        raise NoAnswerError(f"{found.output} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
+        own = replace(found.rows(at), by=None, options=found.options + by)
+        worst[key] = task.judged(own, structure)
+    return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure))
 
 
 def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
     """Roles and structure alone, with the defaults of `identify`."""
     found = roles(data, y, time=time, wanted=reading)
-    check_record(found)
     return found, model_of(found, _Task(monotonic() + 45.0).structure(found, 30, forecast=False).shape)
 
 
@@ -140,7 +130,7 @@ class _Task:
     gate: bool | None = None
     seed: int = 0
     progress: Callable[[str], None] = lambda text: None
-    source: str = ""
+    source: tuple[str, ...] = ("data.csv",)
 
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
         """The structure of all records, and beside it that of a forecast."""
@@ -154,37 +144,39 @@ class _Task:
             best = replace(best, forecast=search(y, U, max_lag, 1, end, rng))
         return best
 
-    def tracked(self, found: Roles, shape: Shape) -> tuple[Track, Evidence]:
-        """The run of a structure, and what it says of the record."""
-        model = model_of(found, shape)
-        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
-        return run, Evidence(run, level=self.level)
+    def affordable(self, found: Roles, structure: Structure, n: int) -> tuple[Roles, Structure]:
+        """As many of the last samples of every record as can be judged in what is left of the budget, and the note."""
+        sizes = [len(part) for part in found.parts]
+        most = max(LEAST, int(RATE * (self.end - monotonic()) / n / len(sizes)))
+        if most >= max(sizes):
+            return found, structure
+        of = str(sizes[0]) if found.by is None else "every record"
+        short = f"only the last {most} samples of {of} were judged (--budget)"
+        narrowed = "; ".join(filter(None, (structure.narrowed, short)))
+        return found.last(most), replace(structure, narrowed=narrowed)
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
-        """The answer for one record, or its last part if time is short."""
-        model, T = model_of(found, structure.shape), len(found.y)
-        most = max(LEAST, int(RATE * (self.end - monotonic()) / model.n))
-        if most < T:
-            short = f"only the last {most} of {T} samples were judged (--budget)"
-            structure = replace(structure, narrowed="; ".join(filter(None, (structure.narrowed, short))))
-            found = found.last(most)
-        y, U, place = found.spread(structure.na + 40)
+        """The answer for one record."""
+        model = model_of(found, structure.shape)
         self.progress("tracking")
-        run, known = self.tracked(found, structure.shape)
+        run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
+        known = Evidence(run, level=self.level)
         self.progress("time or working point")
+        y, U, place = replace(found, y=run.used_record.y).spread(structure.na + 40)
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
         verdict = judged(known)
-        besides = bool(verdict.drifts)
+        besides, again = bool(verdict.drifts), None
         if besides and why_not.products:
             more = rows._replace(phi=np.hstack([rows.phi, why_not.columns]), lags=None)  # products of lags are given
-            whole = np.flatnonzero(np.isfinite(more.phi).all(axis=1))
-            again = judged_rows(more.only(whole, range(more.phi.shape[1])), self.level)
+            curved = more.only(np.flatnonzero(np.isfinite(more.phi).all(axis=1)), range(more.phi.shape[1]))
+            again = judged_rows(curved, self.level)
             besides = again is None or again.rejected
-        others = (self.tracked(found, shape)[1].p for shape, *_ in structure.second if besides)
-        least = next((p for p in others if p >= self.level), 0.0)
-        theta, memory, own = effects(known)
-        moved, errors = moves(verdict, run, theta, memory.root), errors_of(known, self.horizon)
+        others = (
+            judged_rows(with_lags(rows, y, U, place, shape), self.level) for shape, *_ in structure.second if besides
+        )
+        least = next((one.test.p for one in others if one is not None and not one.rejected), 0.0)
+        memory, own = effects(known)
         other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
         why = f"constants are rejected {other}" if least else verdict.untested
         share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
@@ -193,25 +185,36 @@ class _Task:
             why += "if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
-        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
-                              _notes(found, run, y, U, structure), _undecided(structure, found.inputs, verdict),
-                              self.source)  # fmt: skip
+        happened, told, curve = verdict.events if kind in ("moves", "both") else (), rows, why_not.of[:0]
+        if kind == "both" and again is not None:
+            told, curve = curved, why_not.of
+            happened = events(again, [*model.names, *curve], told.at, run.time_text)
+        moved = moves(happened, run, told, curve, memory.root)
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory,
+                              errors_of(known, self.horizon), _notes(found, run, y, U, structure),
+                              _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
 
 
 def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
     """Problems of the data, each in a few words."""
     fed = [j for j in structure.lags if feedback(y, U[:, j])]
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
-    notes = (
-        "" if found.inputs else f"no input moves, so only its own past can explain {found.output}",
-        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
+    return (
+        *_of_data(found, structure),
         *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
-        f"missing readings: {found.missing}" if found.missing else "",
-        f"gaps in time of {len(y) - len(found.y)} samples in all" if len(y) > len(found.y) else "",
+        *([f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []),
         *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
-        structure.narrowed,
     )
-    return tuple(filter(None, notes))
+
+
+def _of_data(found: Roles, structure: Structure) -> tuple[str, ...]:
+    """Those of all records."""
+    return (
+        *([] if found.inputs else [f"no input moves, so only its own past can explain {found.output}"]),
+        *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
+        *([f"missing readings: {found.missing}"] if found.missing else []),
+        *([structure.narrowed] if structure.narrowed else []),
+    )
 
 
 def _undecided(structure: Structure, names: Sequence[str], verdict: Verdict) -> tuple[str, ...]:

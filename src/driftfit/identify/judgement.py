@@ -1,35 +1,42 @@
 """Judgement of a structure: predictions of the tracker and of constants mixed as they go, and effects in plain units.
 
-With p_1 and p_2 the densities of a reading under the tracker and under recursive least squares on the same regressors,
+With e_1 and e_2 the errors of the tracker and of recursive least squares on the same regressors, and v the mean square
+of the better so far,
 
-    w_t = s + (1 - 2 s) w_(t-1) p_1(y_(t-1)) / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),    y_hat = w y_hat_1 + (1 - w) y_hat_2
+    p_i = exp(-e_i^2 / 2 v),   w_t = s + (1 - 2 s) w_(t-1) p_1 / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),
+    y_hat = w y_hat_1 + (1 - w) y_hat_2
 
-so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). All
-predictions are made before the sample; those h steps ahead are given the inputs, and weighed by what is known then.
+so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). With
+one v for both, they are weighed by what is reported, squared errors. The bound needs bounded predictions, so each stays
+within the outputs so far, widened by their range. All predictions are made before the sample; those h steps ahead are
+given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.identify.roles import NoAnswerError
-from driftfit.identify.structure import Pool
+from driftfit.identify.structure import Pool, Shape
+from driftfit.judge.changes.null import Lags
+from driftfit.judge.changes.words import Event
 from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
+from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.paired import LEAST
 from driftfit.judge.statistics.robust import SMALL, pseudo_inverse
-from driftfit.judge.verdict import Verdict
 from driftfit.run.result import Track, root_mean_square
 from driftfit.use.simulate import moved, steps_ahead
 
 SHARE = 0.001
 """Probability that the other of two predictions is the better one from the next sample on."""
 FOUND = 6.7
-"""Standard errors of a coefficient that a change half-way must have to be found in four of five records: the error of
+"""Standard errors of a coefficient that a change half-way must have to be found with 80 % probability: the error of
 the difference of both halves is twice as large, times 2.8 for a test at 5 %, times 1.2 since the date is not known."""
 
 
@@ -43,7 +50,7 @@ class Errors(NamedTuple):
 
 class Effect(NamedTuple):
     """The effect of an input with constants: in the long run, sum b / (1 - sum a), or in a sample, sum b, with a unit
-    root; without inputs the level. Its standard error; the change half-way that is found in 4 of 5 records.
+    root; without inputs the level. Its standard error; the change half-way that is found with 80 % probability.
     """
 
     name: str
@@ -64,7 +71,9 @@ class Memory(NamedTuple):
 
 
 class Move(NamedTuple):
-    """What an event did to one effect: the static gain of an input, the ``memory`` (sum of a) or the ``level``."""
+    """What an event did to one effect: the static gain of an input, or of a ``bent`` one the standard deviation; the
+    ``memory`` (sum of a) or the ``level``.
+    """
 
     what: str
     kind: str
@@ -74,31 +83,27 @@ class Move(NamedTuple):
     last: str
     at: int
     instead: tuple[str, ...]
+    bent: bool = False
 
 
-def density(e: Array) -> Array:
-    """Log-likelihoods (T,) of errors, Gaussian with the mean of their squares so far; NaN for the first `LEAST`."""
-    known = np.isfinite(e)
-    square, count = np.where(known, e, 0.0) ** 2, np.cumsum(known) - known
-    v = np.where(count > LEAST, np.maximum(np.cumsum(square) - square, SMALL) / np.maximum(count, 1), 1.0)
-    return np.where(known & (count > LEAST), -0.5 * (np.log(2.0 * np.pi * v) + square / v), np.nan)
-
-
-@Driver
-def _weigh(ratio: Array, weight: Array) -> None:
-    """`weights` (T,) from the ratios (T,) of both densities."""
-    now = 0.5
-    for t in range(ratio.shape[0]):
-        weight[t], after = now, now * ratio[t]
-        now = SHARE + (1.0 - 2.0 * SHARE) * after / (1.0 - now + after)
-
-
-def weights(first: Array, second: Array) -> Array:
-    """The weight (T,) of the first of two predictions before each sample, from their log-likelihoods (T,) (Herbster and
-    Warmuth, 1998)."""
-    weight = np.empty(len(first))
-    _weigh(np.exp(np.clip(np.nan_to_num(first - second), -50.0, 50.0)), weight)
-    return weight
+def mixed(y: Array, errors: Array, h: int) -> Array:
+    """Errors (T,) of the mixture of two predictions h steps ahead of y (T,), from their errors (2, T)."""
+    past = moved(y, h)
+    low, high = np.fmin.accumulate(past), np.fmax.accumulate(past)
+    e = y - np.clip(y - errors, 2.0 * low - high, 2.0 * high - low)
+    known = np.isfinite(e).all(axis=0)
+    squares = np.where(known, e**2, 0.0)
+    before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
+    v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
+    with np.errstate(over="ignore"):
+        worth = np.where(count > LEAST, (squares[1] - squares[0]) / (2.0 * v), 0.0)
+    weights = [0.5] * h
+    for ratio in np.exp(np.clip(worth, -50.0, 50.0)).tolist():
+        w = weights[-1]
+        weights.append(SHARE + (1.0 - 2.0 * SHARE) * w * ratio / (1.0 - w + w * ratio))
+    share = np.array(weights[: len(y)])
+    found: Array = share * e[0] + (1.0 - share) * e[1]
+    return found
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
@@ -108,13 +113,11 @@ def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
     far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
-    cases = [(1, own.tracked, own.constant_ls, run.log_density, rivals)]
+    cases = [(1, [own.tracked, own.constant_ls], rivals)]
     if horizon > 1:
-        last = {"persistence": y - moved(persistence(y), horizon - 1)}
-        cases.append((horizon, far[0], far[1], density(far[0]), last))
-    for h, tracked, constants, likely, others in cases:
-        w = np.append(np.full(h - 1, 0.5), weights(likely, density(constants)))[: len(y)]
-        errors = {"driftfit": w * tracked + (1.0 - w) * constants, "tracked": tracked, "constants": constants, **others}
+        cases.append((horizon, far, {"persistence": y - moved(persistence(y), horizon - 1)}))
+    for h, both, others in cases:
+        errors = {"driftfit": mixed(y, np.stack(both), h), "tracked": both[0], "constants": both[1], **others}
         at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
         found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
     return tuple(found)
@@ -134,8 +137,8 @@ def parts(run: Track) -> dict[str, Array]:
     return found
 
 
-def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
-    """Constants theta (n,), the memory of y, and the effects of the inputs."""
+def effects(known: Evidence) -> tuple[Memory, tuple[Effect, ...]]:
+    """The memory of y, and the effects of the inputs."""
     phi, y, own = known.rows.phi, known.rows.y, parts(known.run)
     inverse = pseudo_inverse(phi)
     theta = inverse @ y
@@ -149,37 +152,60 @@ def effects(known: Evidence) -> tuple[Array, Memory, tuple[Effect, ...]]:
         std, alone = (float(np.sqrt(one @ cov @ one)) for one in (slope, own[name] / rest))
         name, least = (known.run.labels.y, std) if name == "level" else (name, alone)  # a level is that of all lags
         found.append(Effect(name, gain, std, FOUND * least))
-    return theta, memory, tuple(found)
+    return memory, tuple(found)
 
 
-def moves(verdict: Verdict, run: Track, theta: Array, root: bool) -> tuple[Move, ...]:
-    """The events of a verdict as changes of effects; ``theta`` (n,) are constants.
+def moves(happened: Sequence[Event], run: Track, rows: Rows, curve: Sequence[str], root: bool) -> tuple[Move, ...]:
+    """Events of ``rows`` as changes of effects; ``curve`` are the names of columns behind those of the model.
 
-    The level is that at mean inputs, and is left out where it moves with others by less than an error of predictions:
-    an effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample.
+    The level is that at mean inputs, and is left out where it moves with others by less than an error of constants: an
+    effect that changes turns the plane about the origin. With a ``root`` effects are those in a sample. Of an effect
+    that is a curve this is the standard deviation.
     """
-    own, text, found = parts(run), run.time_text, []
+    names, text, found = [*run.model.names, *curve], run.time_text, []
+    of, bent = np.array([_what(name) for name in names]), {_what(name) for name in curve}
+    means = {"level": np.mean(rows.phi[:, run.model.n :], axis=0)}
+    own = {what: np.append(x, means.get(what, 0.0 * means["level"])) for what, x in parts(run).items()}
+    theta = pseudo_inverse(rows.phi) @ rows.y
+    rms = root_mean_square(rows.y - rows.phi @ theta)
 
     def value(what: str, theta: Array) -> float:
         memory = own["memory"] @ theta
-        return float(own[what] @ theta / (1.0 if what == "memory" or root or memory >= 1.0 else 1.0 - memory))
+        rest = 1.0 if what == "memory" or root or memory >= 1.0 else 1.0 - memory
+        mine = of == what
+        return float((np.std(rows.phi[:, mine] @ theta[mine]) if what in bent else own[what] @ theta) / rest)
 
     def changed(theta: Array, to: dict[str, float]) -> Array:
-        return np.array([to.get(name, theta[i]) for i, name in enumerate(run.model.names)])
+        return np.array([to.get(name, theta[i]) for i, name in enumerate(names)])
 
-    for event in reversed(verdict.events):
+    for event in reversed(happened):
         theta = changed(theta, {move.name: move.before for move in event.moves})
-    for event in verdict.events:
+    for event in happened:
         after = changed(theta, {move.name: move.after for move in event.moves})
         instead = tuple(dict.fromkeys(_what(name) for move in event.moves for name in move.instead))
         ends = (event.when, event.ended) if event.until is not None else (text(event.earliest), text(event.latest))
         touched = {_what(move.name) for move in event.moves}
         for what in sorted(touched, key=lambda what: (what in ("memory", "level"), what)):
             values = value(what, theta), value(what, after)
-            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > verdict.rms:
-                found.append(Move(what, event.kind, *values, *ends, event.at, instead))
+            if what != "level" or len(touched) == 1 or abs(values[1] - values[0]) > rms:
+                found.append(Move(what, event.kind, *values, *ends, event.at, instead, what in bent))
         theta = theta if event.kind == "temporary" else after
     return tuple(found)
+
+
+def with_lags(rows: Rows, y: Array, U: Array, place: Array, shape: Shape) -> Rows:
+    """Rows of a run with the regressors of another structure, where these are known on the grid; see `Roles.spread`."""
+    at, (na, inputs) = place[rows.at], shape
+    lags = [moved(y, k + 1) for k in range(na)]
+    each = [moved(U[:, j], k) for j, nb, nk in inputs for k in range(nk, nk + nb)]
+    phi = np.column_stack([*lags, *each, np.ones(len(y))])[at]
+    found = rows._replace(phi=phi, lags=None).only(np.isfinite(phi).all(axis=1), range(phi.shape[1]))
+    at, root = place[found.at], np.broadcast_to(np.asarray(found.root, float), found.y.shape)
+    row = np.full(len(y), -1)
+    row[at] = np.arange(len(at))
+    source = row[at[:, None] - np.arange(1, na + 1)]
+    lagged = Lags(np.arange(na), source, root[:, None] / np.where(source < 0, 1.0, root[source])) if na else None
+    return found._replace(phi=found.phi * root[:, None], lags=lagged)
 
 
 def feedback(y: Array, u: Array) -> bool:

@@ -23,7 +23,6 @@ from driftfit.identify.judgement import Effect, Errors, Memory, Move
 from driftfit.identify.roles import Roles
 from driftfit.identify.structure import TIED, Shape, Structure
 from driftfit.identify.working_point import Cause
-from driftfit.judge.alarms.detect import Alarms
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, p_equals
 from driftfit.models.arx import ARX, arx_text
@@ -50,6 +49,13 @@ PROPERTIES: dict[str, Any] = {
 }  # fmt: skip
 SCHEMA = {"title": NAME, "type": "object", "required": list(PROPERTIES), "properties": PROPERTIES}
 """JSON Schema of `Identification.json`."""
+RECORD = {"moves": {"type": ["boolean", "null"]}, "p": PROPERTIES["p"], "q": PROPERTIES["p"]}
+RECORDS = {key: PROPERTIES[key] for key in ("headline", "model", "roles", "notes")} | {
+    "schema": {"const": f"{NAME}/records"}, "worst": {"type": "object", "additionalProperties": SCHEMA},
+    "records": {"type": "object", "additionalProperties": {"type": "object", "properties": RECORD}},
+}  # fmt: skip
+SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": list(RECORDS), "properties": RECORDS}
+"""JSON Schema of `ManyIdentified.json`."""
 CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
 its 95 % band, from the past only. Red: when it changed."""
 
@@ -78,7 +84,7 @@ def conclusion(answer: Identification) -> str:
         return f"A static curve explains it, nothing moves in time: {curve(answer)}."
     if answer.kind == "no drift found":
         least = "; ".join(f"{one.name} by {number(one.least)} from {number(one.gain)}" for one in answer.effects)
-        seen = f"In 4 of 5 records a change half-way of the {answer.effect} would have been found: {least}."
+        seen = f"The smallest change of the {answer.effect}, half-way, that is found with 80 % probability: {least}."
         return f"No drift found in {output} ({p_equals(answer.verdict.p)}). {seen}"
     change = 100.0 * (1.0 - rms["driftfit"] / rms["constants"]) if rms["constants"] > 0.0 else 0.0
     gain = f"lowers the error {change:.0f} %" if change >= 0.5 else "does not lower the error"
@@ -108,7 +114,10 @@ def _event(answer: Identification, own: list[Move]) -> str:
     one, output = own[0], answer.roles.output
     whats = {"memory": f"the memory of {output} (sum of its lags)", "level": f"the level of {output} (at mean inputs)"}
     whats |= {name: f"the effect of {name} on {output} ({delay(answer, name)})" for name in answer.model.input_names}
-    parts = (f"{whats[move.what]} {verb(move)} from {number(move.before)} to {number(move.after)}" for move in own)
+    bent = {move.what: f"the curve of {move.what} on {output} (its standard deviation)" for move in own if move.bent}
+    parts = (
+        f"{(whats | bent)[move.what]} {verb(move)} from {number(move.before)} to {number(move.after)}" for move in own
+    )
     when = {"wandering": "over the whole record", "gradual": f"gradually from {one.first} to {one.last}"}
     date = f"on {one.first}" if one.first == one.last else f"between {one.first} and {one.last}"
     back = ", and was then as before" if one.kind == "temporary" else ""
@@ -163,8 +172,11 @@ def commands(answer: Identification) -> list[str]:
     each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
     given = " ".join(f"--{name} {shlex.quote(value)}" for name, value in each.items() if value)
-    served = f"driftfit serve {shlex.quote(PurePath(answer.source).stem)}.toml   # the unit is on the page"
-    return [*(f"driftfit {verb} {shlex.quote(answer.source)} {given}" for verb in ("track", "detect")), served]
+    served = f"driftfit serve {shlex.quote(PurePath(answer.source[0]).stem)}.toml   # with the unit that --page shows"
+    return [
+        *(f"driftfit {verb} {shlex.join(answer.source)} {given}{roles.options}" for verb in ("track", "detect")),
+        served,
+    ]
 
 
 def interval(roles: Roles) -> str:
@@ -174,20 +186,24 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification) -> str:
     """The unit of a service, as TOML."""
-    own = dict[str, Any](name=PurePath(answer.source).stem, y=answer.roles.output, u=answer.model.input_names)
+    own = dict[str, Any](name=PurePath(answer.source[0]).stem, y=answer.roles.output, u=answer.model.input_names)
     own |= {"dt": answer.roles.dt, "model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     each = ((name, one) for name, one in own.items() if name != "dt" or isinstance(one, str))
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in each)
     return f'[[unit]]\n{text}alarm = {{ every = "1 week" }}\n'
 
 
+def effect(answer: Identification, one: Effect) -> str:
+    """The size of an effect, and whether it moves."""
+    moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
+    size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
+    return f"{size}, {delay(answer, one.name)}{moved}"
+
+
 def lines(answer: Identification) -> list[tuple[str, str]]:
     """The lines of the terminal, each with its style."""
     found = [("bold", line) for line in wrap(conclusion(answer), WIDTH - 1)]
-    for one in answer.effects:
-        moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-        size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
-        found.append(("", f"{one.name:<20} {size}, {delay(answer, one.name)}{moved}"))
+    found += [("", f"{one.name:<20} {effect(answer, one)}") for one in answer.effects]
     for steps, rms, _ in answer.errors:
         each = ", ".join(f"{name} {number(value)}" for name, value in rms.items() if name != "tracked")
         found.append(("", f"Error {steps} step{'' if steps == 1 else 's'} ahead: {each}"))
@@ -218,8 +234,7 @@ def as_json(answer: Identification) -> dict[str, Any]:
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
     found: dict[str, Any] = finite({
         "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
-        "model": repr(answer.model), "p": answer.verdict.p, "roles": {one: getattr(roles, one) for one in
-        ("output", "inputs", "clock", "by", "dt", "why", "refused", "missing")},
+        "model": repr(answer.model), "p": answer.verdict.p, "roles": roles.plain,
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
         "cause": {name: value for name, value in vars(answer.cause).items() if name != "columns"},
         "commands": commands(answer), "unit": unit(answer),
@@ -254,7 +269,7 @@ def figure(answer: Identification) -> Figure:
 def html(answer: Identification, path: Any = None) -> str:
     """The answer as one self-contained HTML page; with a ``path`` it is written there."""
     heading = f"{answer.roles.output} from {', '.join(answer.model.input_names) or 'its own past'}"
-    subtitle = escape(f"{answer.source}, {len(answer.track)} samples, answer: {answer.kind}")
+    subtitle = escape(f"{', '.join(answer.source)}, {len(answer.track)} samples, answer: {answer.kind}")
     first = f'<h1>{escape(heading)}</h1><p class="soft">{subtitle}</p>{opening([conclusion(answer)])}'
     return written(document(heading, [first, *body(answer)]), path)
 
@@ -268,9 +283,11 @@ def body(answer: Identification) -> list[str]:
         signals = f"RLS(1.0), y={answer.roles.output!r}, u={list(answer.model.input_names)}, data=.."
         curve = f"<p>That curve, fitted:</p><pre>{escape(f'track({answer.curve.model!r}, {signals})')}</pre>"
     copied = "".join(f"<pre>{escape(one)}</pre>" for one in (*commands(answer)[:2], unit(answer)))
+    each = (f"{one.name}: {effect(answer, one)}; smallest change that would have been found {number(one.least)}"
+            for one in answer.effects)  # fmt: skip
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
-        section("What, since when, how large", _listed(sentences(answer)) + _effects(answer)),
+        section("What, since when, how large", _listed([*sentences(answer), *each])),
         section("The picture", picture(figure(answer), answer.track, CAPTION)),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
@@ -285,20 +302,13 @@ def _listed(sentences: Any) -> str:
     return points([escape(one) for one in sentences])
 
 
-def _effects(answer: Identification) -> str:
-    rows = [(escape(name), delay(answer, name), number(gain) + escape(units(answer, name)), f"{std:.2g}", number(least))
-            for name, gain, std, least in answer.effects]  # fmt: skip
-    heads = ("input", "delay", answer.effect, "+-", "smallest change found")
-    return table("Effects with constant parameters, in units of the output per unit of the input.", heads, rows, (1,))
-
-
 def _errors(answer: Identification) -> str:
     heads, rows = tuple(answer.errors[0].rms), []
     for steps, rms, samples in answer.errors:
         style = {name: ' class="bad"' if value < rms["driftfit"] else "" for name, value in rms.items()}
         cells = (f"<span{style[name]}>{rms[name]:.4g}</span>" if name in rms else "" for name in heads)
         rows.append((f"{steps} ahead", *cells, str(samples)))
-    caption = "Root mean square errors of predictions made before the sample, tracked and constants mixed. Red: lower."
+    caption = "Root mean square errors of predictions before the sample; driftfit mixes both of the next. Red: lower."
     return table(caption, ("", *heads, "samples"), rows)
 
 
@@ -306,7 +316,7 @@ def page_of_many(answer: ManyIdentified, path: Any = None) -> str:
     """One page: the table of all records, then the three that move most clearly."""
     heads, verdict = ("record", "what moves", "p", "q", "error", "of constants", "pays"), answer.verdict
     rows = [(escape(str(row.key)), *map(escape, row.cells)) for row in verdict.rows]
-    shown = table("The clearest first.", heads, rows, (1,)) + _listed(columns(answer.roles))
+    shown = table("The clearest first.", heads, rows, (1,)) + _listed([*columns(answer.roles), *answer.notes])
     parts = [f"<h1>{len(rows)} records</h1>", opening(verdict.sentences), section("All records", shown)]
     for key, one in answer.worst.items():
         parts += [f"<h2>{escape(str(key))}</h2>", opening([conclusion(one)]), *body(one)]
@@ -345,7 +355,7 @@ class Identification(Printed):
     errors: tuple[Errors, ...]
     notes: tuple[str, ...]
     undecided: tuple[str, ...]
-    source: str
+    source: tuple[str, ...]
 
     @property
     def code(self) -> int:
@@ -359,17 +369,10 @@ class Identification(Printed):
         return "effect in a sample" if self.memory.root else lasting
 
     @cached_property
-    def alarms(self) -> Alarms:
-        """Alarms whose reference is what followed the last change; ``alarms.rule`` is armed from now on."""
-        last, T = max((move.at for move in self.moves), default=0), len(self.track)
-        start = last if T - last > T // 4 else 3 * T // 4
-        return self.track.detect("glr", reference=(self.track.time[start], self.track.time[T - 1]))
-
-    @cached_property
     def curve(self) -> Track:
-        """A Hammerstein-Wiener model with the curve of one input, or of all where it is of several, with constants."""
-        model, bent = self.model, self.cause.bent
-        bases = [Polynomial(3) if bent < 0 or name == self.roles.inputs[bent] else None for name in model.input_names]
+        """A Hammerstein-Wiener model with constants and a curve of each input that bends, of all if the output does."""
+        model, bent = self.model, "".join(self.cause.of)
+        bases = [Polynomial(3) if f"[{name}]" in bent or "[" not in bent else None for name in model.input_names]
         nb, nk = zip(*model.lags, strict=True)
         curved = HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
         fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
@@ -392,6 +395,7 @@ class ManyIdentified(Printed):
     verdict: ManyVerdicts = field(repr=False)
     worst: Mapping[Any, Identification]
     roles: Roles = field(repr=False)
+    notes: tuple[str, ...]
     page = page_of_many
 
     @property
@@ -408,12 +412,14 @@ class ManyIdentified(Printed):
         """The records by key, and in ``worst`` the clearest as for one record."""
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
         worst = {str(key): one.json() for key, one in self.worst.items()}
-        shown = {"schema": f"{NAME}/records", "headline": self.headline}
-        return shown | {"records": finite(rows), "worst": worst}
+        shown = {"schema": f"{NAME}/records", "headline": self.headline, "model": repr(self.model), "notes": self.notes}
+        data: dict[str, Any] = finite(shown | {"roles": self.roles.plain, "records": rows, "worst": worst})
+        return data
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield Text(f" {len(self.verdict)} records with one structure: {self.model!r}")
-        yield Text(" " + "\n ".join(columns(self.roles)))
+        data = f"Data: {'; '.join(self.notes)}." if self.notes else ""
+        yield Text("\n".join(f" {line}" for text in (*columns(self.roles), data) for line in wrap(text, WIDTH - 1)))
         yield self.verdict
         for key, one in self.worst.items():
-            yield Text(f"\n {key}: {one.headline}")
+            yield Text("\n " + "\n ".join(wrap(f"{key}: {one.headline}", WIDTH - 1)))

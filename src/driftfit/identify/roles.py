@@ -1,16 +1,18 @@
 """Roles: what each column of a table is, so that y, u, time and key need not be given.
 
 The time holds dates, or, where no column does, is the first whose numbers increase by even steps. The key is text with
-few values, or tells the records between which the clock runs back. A label is 0 or 1 and changes at less than
-`SWITCHES` of the rows, as an operator's mark of a fault. Inputs are the other columns of numbers, without constants,
-copies, second clocks and what is mostly empty. Fault codes and spikes are missing, in inputs as in y
-(`driftfit.readings.screen.apart`).
+few values, whose records follow each other or share their times, or tells the records between which the clock runs
+back. A label is 0 or 1 and changes at less than `SWITCHES` of the rows, as an operator's mark of a fault. Inputs are
+the other columns of numbers, without constants, copies, second clocks and what is mostly empty. Fault codes and spikes
+are missing, in inputs as in y (`driftfit.readings.screen.apart`).
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import narwhals as nw
@@ -22,9 +24,11 @@ from driftfit.data.columns import FILE, Wanted, numbers_of, times_of_column
 from driftfit.data.files import paths_of, read_file, table_frame
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
+from driftfit.identify.scores import FEWEST
 from driftfit.readings.screen import apart
 
 SWITCHES = 0.02
+BACK = "the clock, which runs back"
 ALIKE = 1e-6
 """How far below 1 the correlation of two copies may be."""
 
@@ -38,7 +42,8 @@ class Roles:
     """The columns, and the record: y (T,), U (T, m), time (T,) or None, key of every row.
 
     ``dt``: nominal interval, as for `track`. ``why``: why a column is no input. ``refused``: readings taken as
-    missing, by column. ``missing``: readings that were missing already.
+    missing, by column. ``missing``: readings that were missing already. ``options``: how
+    the file was read, as options of the command.
     """
 
     output: str
@@ -54,7 +59,15 @@ class Roles:
     refused: Mapping[str, int] = field(default_factory=dict)
     missing: int = 0
     units: Mapping[str, str] = field(default_factory=dict)
+    options: str = ""
     zone: str | None = None
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """What is not data of single rows."""
+        return {
+            one: getattr(self, one) for one in ["output", "inputs", "clock", "by", "dt", "why", "refused", "missing"]
+        }
 
     @property
     def groups(self) -> Array:
@@ -62,21 +75,26 @@ class Roles:
         place = {key: k for k, key in enumerate(dict.fromkeys(self.key))}
         return np.array([place[key] for key in self.key])
 
+    @property
+    def parts(self) -> list[Array]:
+        """The rows of every record."""
+        groups = self.groups
+        return np.split(np.argsort(groups, kind="stable"), np.cumsum(np.bincount(groups))[:-1])
+
     def rows(self, at: Array) -> Roles:
         """Some rows."""
         time = None if self.time is None else self.time[at]
         return replace(self, y=self.y[at], U=self.U[at], time=time, key=tuple(self.key[t] for t in at))
 
     def last(self, count: int) -> Roles:
-        """The last rows; without a clock their numbers are the time."""
-        at = np.arange(len(self.y) - count, len(self.y))
+        """The last rows of every record; without a clock their numbers are the time."""
+        at = np.sort(np.concatenate([part[-count:] for part in self.parts]))
         kept = self.rows(at)
         return kept if self.time is not None else replace(kept, time=at.astype(float), dt=1.0)
 
     def centred(self) -> Roles:
         """The same with signals of mean 0 in every record, because their levels may differ."""
-        parts = [np.flatnonzero(self.groups == k) for k in range(self.groups.max() + 1)]
-        means = np.array([np.nanmean(np.column_stack([self.y, self.U])[at], axis=0) for at in parts])[self.groups]
+        means = np.array([np.nanmean(np.column_stack([self.y, self.U])[at], axis=0) for at in self.parts])[self.groups]
         return replace(self, y=self.y - means[:, 0], U=self.U - means[:, 1:])
 
     def signals(self, inputs: Sequence[str]) -> dict[str, Any]:
@@ -128,7 +146,9 @@ def roles(
             raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(left)}.")
         y = left[0]
     if worded := [name for name in (y, *(u or ())) if name not in numbers]:
-        raise NoAnswerError(f"{worded[0]} holds text, such as {frame[worded[0]][0]!r}; numbers are needed.")
+        cell = str(frame[worded[0]][0])
+        hint = " (--decimal , reads decimal commas)" if "," in cell else ""
+        raise NoAnswerError(f"{worded[0]} holds text, such as {cell!r}; numbers are needed{hint}.")
     refused, kept = {}, list(u or ())
     for name in {*left, y, *kept} & numbers.keys():
         low, high = (limits or {}).get(name) or (None, None)
@@ -147,14 +167,30 @@ def roles(
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}
     missing = int(np.sum(~np.isfinite(numbers[y])) + np.sum(~np.isfinite(U))) - sum(refused.values())
-    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units, zone)
+    known = numbers[y][np.isfinite(numbers[y])]
+    if len(known) < FEWEST:
+        raise NoAnswerError(f"{len(known)} of {len(frame)} rows hold {y}; at least {FEWEST} are needed.")
+    if not _moves(known):
+        raise NoAnswerError(f"{y} is {known[0]:g} in all {len(known)} rows; it must move to be explained.")
+    found = Roles(y, tuple(kept), clock, by, numbers[y], U, axis, key, dt, why, refused, missing, units,
+                  _options(wanted or Wanted(()), limits or {}), zone)  # fmt: skip
     return _in_order(found)
+
+
+def _options(wanted: Wanted, limits: Mapping[str, tuple[float | None, float | None]]) -> str:
+    """How a file was read, as options of the command."""
+    given = [("decimal", wanted.decimal)] if wanted.decimal != "." else []
+    given += [(name, text) for name in ("separator", "dates") if (text := getattr(wanted, name))]
+    given += [("missing", text) for text in wanted.missing]
+    ends = {name: ["" if one is None else f"{one:g}" for one in both] for name, both in limits.items()}
+    given += [("limits", f"{name}={low}:{high}") for name, (low, high) in ends.items()]
+    return "".join(f" --{name} {shlex.quote(text)}" for name, text in given)
 
 
 def _in_order(found: Roles) -> Roles:
     """The record by key and time, without rows that repeat a time or have none, and with its interval."""
     if found.time is None:
-        return found
+        return found.rows(np.argsort(found.groups, kind="stable"))
     order = np.lexsort((found.time, found.groups))
     order = order[np.isfinite(found.time[order])]
     time, groups = found.time[order], found.groups[order]
@@ -238,13 +274,19 @@ def _reason(numbers: Mapping[str, Array], name: str, others: Iterable[str]) -> s
 
 
 def _key(frame: Any, texts: Sequence[str], by: str | None, axis: Array | None) -> tuple[tuple[Any, ...], str | None]:
-    """(key of every row, name of the column): given, of text with few values, or where the clock runs back."""
-    count = {name: len(set(frame[name].to_list())) for name in texts}
-    few = [name for name in texts if 2 <= count[name] <= len(frame) // 30]
+    """(key of every row, name of the column): given, of text with few values, or where the clock runs back.
+
+    Text that changes to and fro in one time is a state of one plant, and no key.
+    """
+    cells = {name: frame[name].to_list() for name in texts}
+    count = {name: len(set(column)) for name, column in cells.items()}
+    together = axis is not None and len(np.unique(axis)) < len(axis)
+    few = [name for name, column in cells.items() if 2 <= count[name] <= len(frame) // 30
+           and (together or sum(a != b for a, b in pairwise(column)) < count[name])]  # fmt: skip
     by = by or max(few, key=lambda name: count[name], default=None)
     if by is not None:
         return tuple(frame[by].to_list()), by
     back = np.append(False, axis[1:] < axis[:-1]) if axis is not None else np.zeros(len(frame), bool)
     if 0 < back.sum() <= len(frame) // 100:
-        return tuple(f"record {k + 1}" for k in np.cumsum(back)), "record"
+        return tuple(f"record {k + 1}" for k in np.cumsum(back)), BACK
     return (0,) * len(frame), None

@@ -7,6 +7,8 @@ and lengthens, shortens and shifts its lags, as long as the score less a price r
 input costs log p nats, where p is the number of columns among which it was chosen, and each column `COLUMN`. Of the
 structures on the way the simplest within one standard error of the best is taken. An input must then beat copies of
 itself that are displaced in time or reversed, each at its best delay, because a slow input resembles any slow drift.
+Then the inputs that were left out are searched again by their squares about the median: one with the same effect on
+both sides has no straight line.
 
 What is predicted is the present output: with nk = 0 an input explains it, but does not forecast it.
 """
@@ -167,6 +169,15 @@ def search(y: Array, U: Array, M: int, first: int, end: float, rng: np.random.Ge
     doubtful = tuple(j for j, _, _ in shape[1] if monotonic() < end and not _beats_copies(y, U, shape, j, rng))
     if doubtful:  # the others may need other lags without them
         shape = without(pool.climb(without(shape, doubtful), end), doubtful)
+    used = [j for j, _, _ in shape[1]]
+    squares = (U - np.nanmedian(np.where(np.isfinite(U), U, np.nan), axis=0)) ** 2
+    squares[:, used] = U[:, used]
+    even = Pool(y, squares, M, first)
+    even.scores.refer(even.columns(shape))
+    other = even.simplest(even.climb(without(shape, doubtful), end))
+    found = [j for j, _, _ in other[1] if j not in used]
+    if found and all(_beats_copies(y, squares, other, j, rng) for j in found):
+        pool, shape, U = even, other, squares
     narrowed = "; ".join(filter(None, (narrowed, "the budget of time ended the search" if monotonic() > end else "")))
     return _told(pool, shape, doubtful, _of_log(pool, shape, y, U, first), narrowed)
 

@@ -35,15 +35,15 @@ class Cause:
     """What explains the record: leads over constants in nats, less the logarithm of the number of products for each
     that is used, with their standard errors.
 
-    ``products``: what the curve is made of, in words; none where no curve leads. ``bent``: the input of which it is a
-    static curve, or -1.
+    ``products``: what the curve is made of, in words; none where no curve leads. ``of``: a name for each column that
+    ends with the input that it bends, in brackets.
     """
 
     tracked: tuple[float, float]
     curve: tuple[float, float]
     joint: tuple[float, float]
     products: tuple[str, ...]
-    bent: int
+    of: tuple[str, ...]
     columns: Array
     """(N, k): the products."""
 
@@ -56,7 +56,7 @@ class Cause:
         return "both" if self.joint[0] - self.tracked[0] > CLEAR else "time"
 
 
-def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
+def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, str]]) -> Cause:
     """Compare the four descriptions of y (N,) on phi (N, n), the constant last, and `products` Z (N, q)."""
     X = np.column_stack([phi[:, -1], phi[:, :-1], Z])
     rows, base = np.isfinite(X).all(axis=1), list(range(phi.shape[1]))
@@ -70,25 +70,26 @@ def cause(phi: Array, y: Array, Z: Array, made: list[tuple[str, int]]) -> Cause:
     (curve, one), (joint, other) = (lead(scores.terms(bent), constants) for scores in (steady, moving))
     price *= len(chosen)
     leads = lead(moving.terms(base), constants), (curve - price, one), (joint - price, other)
-    own = {made[one][1] for one in chosen}
     words = tuple(dict.fromkeys(made[one][0] for one in chosen))
-    return Cause(*leads, words, own.pop() if len(own) == 1 else -1, Z[:, chosen])
+    of = tuple(f"{k}{made[one][1]}" for k, one in enumerate(chosen))
+    return Cause(*leads, words, of, Z[:, chosen])
 
 
 def products(
     y: Array, U: Array, structure: Structure, names: tuple[str, ...], output: str, first: int
-) -> tuple[Array, list[tuple[str, int]]]:
-    """(T, q) products of signals on a grid; for each words and the input that is bent, -1 for one of two signals."""
+) -> tuple[Array, list[tuple[str, str]]]:
+    """(T, q) products of signals on a grid; for each its words, and "[input]", or "" for a lag of the output."""
     past, inputs = filled(y), [filled(u) for u in U.T]
     slow = np.convolve(np.where(np.isfinite(past), past, np.nanmean(past)), np.full(SLOW, 1.0 / SLOW))[: len(y)]
     slow[: SLOW - 1] = np.nan
     signals = [(f"{output}, the last", moved(past, 1)), (f"the level of {output}", moved(slow, 1))]
     signals += [(names[i], moved(x, first)) for i, x in enumerate(inputs)]
-    xs = [(names[j], j, moved(inputs[j], k)) for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]
-    xs += [(output, -1, moved(past, 1))] if structure.na else []
-    made = [(f"a bend of {name} at {q:.3g}", j, np.maximum(x - q, 0.0))
-            for name, j, x in xs for q in np.nanquantile(x, (0.25, 0.5, 0.75))]  # fmt: skip
-    made += [(f"{name} times {other}", -1, x * bend)
-             for name, _, x in xs for other, w in signals if not np.array_equal(w, x, equal_nan=True)
+    xs = [(names[j], f"[{names[j]}]", moved(inputs[j], k))
+          for j, nb, nk in structure.shape[1] for k in range(nk, nk + nb)]  # fmt: skip
+    xs += [(output, "", moved(past, 1))] if structure.na else []
+    made = [(f"a bend of {name} at {q:.3g}", of, np.maximum(x - q, 0.0))
+            for name, of, x in xs for q in np.nanquantile(x, (0.25, 0.5, 0.75))]  # fmt: skip
+    made += [(f"{name} times {other}", of, x * bend)
+             for name, of, x in xs for other, w in signals if not np.array_equal(w, x, equal_nan=True)
              for bend in (w - np.nanmedian(w), np.maximum(w - np.nanmedian(w), 0.0))]  # fmt: skip
-    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, j) for text, j, _ in made]
+    return np.stack([np.zeros(len(y)), *(z for *_, z in made)], axis=1)[:, 1:], [(text, of) for text, of, _ in made]

@@ -286,12 +286,15 @@ class ManyDiagnoses(Printed):
         yield table
 
 
+Judged = tuple[Verdict, float, int]
+"""A verdict, with `coverage` and the number of readings left out."""
+
+
 def verdicts(
     runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
     """Judge runs by key, whose parts ``by`` names; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    found = on_all_cores(runs, lambda key: (runs[key], level, lags, burn), verdict, "verdict")
-    return ranked(found, runs, by, level)
+    return ranked(on_all_cores(runs, lambda key: (runs[key], level, lags, burn), _one, "verdict"), by, level)
 
 
 def verdicts_and_diagnoses(
@@ -299,26 +302,27 @@ def verdicts_and_diagnoses(
 ) -> tuple[ManyVerdicts, ManyDiagnoses]:
     """The verdicts and the diagnoses, which share the test of constancy of each run."""
     pairs = on_all_cores(runs, lambda key: (runs[key], level), _both, "report")
-    judgements = ranked({key: one for key, (one, _) in pairs.items()}, runs, by, level)
+    judgements = ranked({key: one for key, (one, _) in pairs.items()}, by, level)
     return judgements, ManyDiagnoses({key: health for key, (_, health) in pairs.items()}, by)
 
 
-def _both(run: Track, level: float) -> tuple[Verdict, Diagnosis]:
+def _one(run: Track, level: float, lags: int | None, burn: int | None) -> Judged:
+    return verdict(run, level, lags, burn), coverage(run), len(run.left_out)
+
+
+def _both(run: Track, level: float) -> tuple[Judged, Diagnosis]:
     known = Evidence(run, level=level)
-    return judged(known), diagnosis(known)
+    return (judged(known), coverage(run), len(run.left_out)), diagnosis(known)
 
 
-def ranked(
-    verdicts: Mapping[Hashable, Verdict], runs: Mapping[Hashable, Track], by: tuple[str, ...], level: float
-) -> ManyVerdicts:
-    """Verdicts of runs by key with their q-values, the clearest first."""
-    q, q_pays = (
-        discoveries(np.array(p)) for p in ([v.p for v in verdicts.values()], [v.constants.p for v in verdicts.values()])
-    )
+def ranked(found: Mapping[Hashable, Judged], by: tuple[str, ...], level: float) -> ManyVerdicts:
+    """What was found of runs by key, with q-values, the clearest first."""
+    truths = [one for one, _, _ in found.values()]
+    q, q_pays = (discoveries(np.array(p)) for p in ([v.p for v in truths], [v.constants.p for v in truths]))
     rows = []
-    for (key, one), a, b in zip(verdicts.items(), q.tolist(), q_pays.tolist(), strict=True):
+    for (key, (one, inside, lost)), a, b in zip(found.items(), q.tolist(), q_pays.tolist(), strict=True):
         drifts, pays = (None if np.isnan(value) else value < level for value in (a, b))
-        rows.append(Judgement(key, one, a, b, drifts, pays, coverage(runs[key]), len(runs[key].left_out)))
+        rows.append(Judgement(key, one, a, b, drifts, pays, inside, lost))
     return ManyVerdicts(tuple(rows), level, by).ranked("clearest")
 
 

@@ -38,6 +38,9 @@ WORTH = 5.0
 BATCH = 0.2
 """Seconds of work that are sent to a process at once."""
 
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+"""A process has one core: threads of its linear algebra would wait for one another, and take twice the time."""
+
 SERVE = "from driftfit.judge.on_all_cores import serve; serve()"
 
 
@@ -86,9 +89,6 @@ def _judged(
     yield from pool.map(judged, batches)
 
 
-Process = subprocess.Popen[bytes]
-
-
 def available() -> bool:
     """Whether ``sys.executable`` is Python; in a program that embeds or freezes Python it is that program."""
     return Path(sys.executable or "").stem.lower().startswith(("python", "pypy"))
@@ -99,16 +99,16 @@ class Processes:
 
     def __init__(self, count: int) -> None:
         path = os.pathsep.join(filter(None, sys.path))
-        self._all = [
+        self._all: list[Any] = [
             subprocess.Popen(
                 [sys.executable, "-c", SERVE],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                env=os.environ | {"PYTHONPATH": path},
+                env=os.environ | {"PYTHONPATH": path} | ONE_THREAD,
             )
             for _ in range(count)
         ]
-        self._idle: SimpleQueue[Process] = SimpleQueue()
+        self._idle: SimpleQueue[Any] = SimpleQueue()
         for process in self._all:
             self._idle.put(process)
 
@@ -122,14 +122,14 @@ class Processes:
             process.wait()
             for stream in (process.stdin, process.stdout):
                 with suppress(OSError):  # what was not sent to a process that has ended
-                    _open(stream).close()
+                    stream.close()
 
     def map(self, judge: Callable[..., Any], batch: Sequence[tuple[Any, ...]]) -> list[Any]:
         """``judge(*arguments)`` for each entry of the batch, in an idle process, or here if that fails."""
         process = self._idle.get()
         try:
-            _send(_open(process.stdin), (judge, batch))
-            found = pickle.loads(pickle.load(_open(process.stdout)))
+            _send(process.stdin, (judge, batch))
+            found = pickle.loads(pickle.load(process.stdout))
         except (OSError, EOFError, pickle.PickleError, AttributeError, TypeError):
             found = None
         finally:
@@ -154,11 +154,6 @@ def serve() -> None:
         except Exception:
             answer = None
         _send(answers, answer)
-
-
-def _open(stream: IO[bytes] | None) -> IO[bytes]:
-    assert stream is not None
-    return stream
 
 
 def _send(stream: IO[bytes], what: Any) -> None:

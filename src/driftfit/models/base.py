@@ -26,8 +26,6 @@ class Model(Settings, ABC):
     is known; `bind` returns the bound model, and everything else needs one.
     """
 
-    intercept: bool = False
-    """Whether the last regressor is the constant 1."""
     constant: ClassVar[str] = ""
     """The setting that adds a constant to the prediction, of a model that predicts none without it."""
 

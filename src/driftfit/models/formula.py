@@ -133,6 +133,7 @@ class Writer:
 
     def __init__(self, formula: Formula, inputs: tuple[str, ...], differentiates: bool = True) -> None:
         self.formula, self.inputs, self.differentiates = formula, inputs, differentiates
+        self.parameters = formula.parameters
         self.lines: list[str] = []
 
     def let(self, code: str) -> str:
@@ -145,7 +146,7 @@ class Writer:
             case ast.Constant():
                 return repr(float(node.value)), {}  # type: ignore[arg-type]
             case ast.Attribute():
-                i = self.formula.parameters.index(node.attr)
+                i = self.parameters.index(node.attr)
                 return self.let(f"s.point[{i}, l]"), {i: "1.0"} if self.differentiates else {}
             case ast.Name():
                 return (repr(float(np.pi)), {}) if node.id == "pi" else self.signal(node.id, 0)

@@ -27,7 +27,6 @@ Walther, Evaluating Derivatives (2008), chapter 3. Cost per sample: that of `Joi
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -161,13 +160,7 @@ class _StateWriter(Writer):
 
     def __init__(self, system: System, inputs: tuple[str, ...]) -> None:
         super().__init__(system.lines[-1], inputs)
-        self.system, self.present = system, {}  # type: ignore[var-annotated]
-
-    def write(self, node: ast.expr) -> tuple[str, dict[int, str]]:
-        if isinstance(node, ast.Attribute):
-            i = self.system.parameters.index(node.attr)
-            return self.let(f"s.point[{i}, l]"), {i: "1.0"}
-        return super().write(node)
+        self.system, self.parameters, self.present = system, system.parameters, {}  # type: ignore[var-annotated]
 
     def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
         if name == TIME:

@@ -18,7 +18,8 @@ least squares on the others only q with nu residuals, and with k doubtful sample
     nu (Q - q) > WORSE k q
 
 Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
-the state before the first sample and replays whole samples without the codes, once.
+the state before the first sample and replays whole samples without the codes, once. Several outputs are kept together,
+each is judged by its own regression, and the samples are replayed without the codes of all.
 
 Source: the test is Chow's (1960), the median deviation as a scale Hampel's (1974), the recursive QR decomposition
 Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(N^2 (n + m) + N n^2) once.
@@ -26,7 +27,7 @@ Gentleman's (1974); what is doubtful is ours. Cost: a copy of the sample, and O(
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -44,26 +45,35 @@ FEW = 3
 """Values that differ from the median, from which on their distance is usual."""
 ROUNDED = 1e-20
 """Share of the sum of squares of y that may be an error of rounding."""
-Y, READING, DT, NOISE, DRIFT, TIMES, U = range(7)
-CODES = Y
-"""Columns of a kept sample: output (NaN if it cannot be used) and reading (NaN if missing), intervals since the last
-sample, factors of noise and drift, how often it came, and the first input. The regressor follows the inputs. When it is
-decided, which signals are codes takes the place of the output."""
+TIMES, READING, DT, NOISE, DRIFT, U = range(6)
+CODES = -1
+"""Columns of a kept sample: how often it came, its reading (NaN if missing), intervals since the last sample, factors
+of noise and drift, the inputs, the regressor (NaN if it is incomplete), and what a linearised model subtracts from y.
+When it is decided, which signals are codes takes the last place."""
 
 
-def no_samples(first: int, n: int, m: int) -> Mapping[str, Any]:
-    """Fields before the first sample."""
+def no_samples(first: int, n: int, m: int, shifts: bool) -> Mapping[str, Any]:
+    """Fields before the first sample; with ``shifts`` the model subtracts something from y."""
     N = first + n if first > 0 else 1
     return {
-        "gate_first": np.full((N, U + m + n), np.nan), "gate_kept": 0, "gate_decided": 0 if first > 0 else 1,
-        "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)), "gate_doubt": np.zeros(N), "raw_y": np.nan,
+        "gate_first": np.full((N, U + max(m, 1) + n + shifts), np.nan), "gate_kept": 0,
+        "gate_decided": 0 if first > 0 else 1, "gate_replay": 0, "gate_fit": np.zeros((n + 1, n + 1)),
+        "gate_doubt": np.zeros(N), "raw_y": np.nan,
     }  # fmt: skip
 
 
 @kernel
-def reading_now(s: State, l: int) -> float:
-    """The reading as it was measured, which a model may have replaced by a function of it; NaN if it is missing."""
-    return s.raw_y[l] if s.observed[l] > 0.0 else np.nan
+def present(s: State, column: int, l: int) -> float:
+    """The entry of the present sample in a column, but for `TIMES`."""
+    PHI = U + s.u.shape[0]
+    if column < U:
+        factor = s.dt[l] if column == DT else s.noise[l] if column == NOISE else s.drift[l]
+        reading = s.raw_y[l] if s.observed[l] > 0.0 else np.nan  # as it was measured
+        return reading if column == READING else factor
+    if column < PHI:
+        return s.u[column - U, l]  # type: ignore[no-any-return]
+    phi = s.phi[min(column - PHI, s.phi.shape[0] - 1), l] if s.valid[l] > 0.0 else np.nan
+    return phi if column < PHI + s.phi.shape[0] else s.shift[l]
 
 
 @kernel
@@ -92,12 +102,12 @@ def usual_value(s: State, column: int, center: float, apart: bool, l: int) -> fl
     return 0.0 if apart else np.nan
 
 
-@kernel
-def judge_each(s: State, implicit: bool, l: int) -> bool:
-    """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0; whether there is such a one."""
-    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+@partial(kernel, short=True)
+def judge_each(s: State, implicit: bool, l: int) -> None:
+    """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0."""
+    N, n, PHI = s.gate_first.shape[0], s.phi.shape[0], U + s.u.shape[0]
     center = usual_value(s, READING, 0.0, False, l)
-    most, some = OUTLYING * usual_value(s, READING, center, True, l), False
+    most = OUTLYING * usual_value(s, READING, center, True, l)
     for k in range(N):
         s.gate_doubt[k, l] = 1.0 if abs(s.gate_first[k, READING, l] - center) > most else 0.0
     for i in range(n):
@@ -110,17 +120,24 @@ def judge_each(s: State, implicit: bool, l: int) -> bool:
                 s.gate_doubt[k, l] = d + 2.0
     for k in range(N):
         s.gate_doubt[k, l] = s.gate_doubt[k, l] if s.gate_doubt[k, l] < 3.0 else 0.0
-        some |= s.gate_doubt[k, l] > 0.0
-    return some
 
 
 @kernel
-def rotate_in(s: State, k: int, l: int) -> float:
+def regressed(s: State, k: int, l: int) -> float:
+    """The output of the regression at sample k; NaN if it cannot be used."""
+    PHI, last = U + s.u.shape[0], s.gate_first.shape[1] - 1
+    y = s.gate_first[k, READING, l] - (s.gate_first[k, last, l] if last == PHI + s.phi.shape[0] else 0.0)
+    complete = s.gate_first[k, PHI, l] == s.gate_first[k, PHI, l]
+    return y if complete & (s.gate_first[k, NOISE, l] < np.inf) else np.nan
+
+
+@kernel
+def rotate_in(s: State, k: int, y: float, l: int) -> float:
     """Givens rotations of one row into the triangle ``gate_fit``, [phi' y]; returns the square that it adds."""
-    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+    n, PHI = s.phi.shape[0], U + s.u.shape[0]
     for i in range(n):
         s.gate_fit[n, i, l] = s.gate_first[k, PHI + i, l]
-    s.gate_fit[n, n, l] = s.gate_first[k, Y, l]
+    s.gate_fit[n, n, l] = y
     for i in range(n):
         a, b = s.gate_fit[i, i, l], s.gate_fit[n, i, l]
         larger = max(abs(a), abs(b))
@@ -142,23 +159,24 @@ def contradicted(s: State, l: int) -> bool:
     spare, some, alone, more, total = -s.phi.shape[0], 0, 0.0, 0.0, 0.0
     for turn in range(2):
         for k in range(s.gate_first.shape[0]):
-            sure, y = turn == 0, s.gate_first[k, Y, l]
+            sure, y = turn == 0, regressed(s, k, l)
             if (y == y) & (sure == (s.gate_doubt[k, l] == 0.0)):
-                square = rotate_in(s, k, l)
+                square = rotate_in(s, k, y, l)
                 spare, some = spare + (1 if sure else 0), some + (0 if sure else 1)
                 alone, more = alone + (square if sure else 0.0), more + (0.0 if sure else square)
                 total += y**2 if sure else 0.0
     return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
 
 
-@kernel
-def mark(s: State, ages: int, l: int) -> None:
-    """The signals that made samples doubtful, as bits in the column of y: 1 for the output, 2, 4, .. for inputs."""
-    N, PHI = s.gate_first.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
+@partial(kernel, short=True)
+def mark(s: State, ages: int, l: int) -> bool:
+    """The signals that made samples doubtful, as bits in the last column: 1 for the output, 2, 4, .. for inputs; none
+    if the others do not contradict them."""
+    N, last, bit, found = s.gate_first.shape[0], s.gate_first.shape[1] - 1, 2.0, contradicted(s, l)
     for k in range(N):
-        s.gate_first[k, CODES, l] = 1.0 if s.gate_doubt[k, l] == 1.0 else 0.0
-    bit = 2.0
-    for j in range(PHI - U):
+        s.gate_doubt[k, l] = s.gate_doubt[k, l] if found else 0.0
+        s.gate_first[k, last, l] = 1.0 if s.gate_doubt[k, l] == 1.0 else 0.0
+    for j in range(s.u.shape[0]):
         center = usual_value(s, U + j, 0.0, False, l)
         most = OUTLYING * usual_value(s, U + j, center, True, l)
         for k in range(N):
@@ -166,93 +184,54 @@ def mark(s: State, ages: int, l: int) -> None:
             for later in range(k, min(k + ages + 1, N)):
                 hit = bit if s.gate_doubt[later, l] == 2.0 else hit
             outside = abs(s.gate_first[k, U + j, l] - center) > most
-            s.gate_first[k, CODES, l] += hit if outside else 0.0
+            s.gate_first[k, last, l] += hit if outside else 0.0
         bit *= 2.0
+    return found  # type: ignore[no-any-return]
 
 
 @kernel
-def beginning(s: State, l: int) -> int:
-    """With how many equal readings the samples begin."""
-    N, equal = s.gate_first.shape[0], 1
-    while (equal < N) and (s.gate_first[equal, READING, l] == s.gate_first[0, READING, l]):
+def enough(s: State, l: int) -> bool:
+    """Whether the output moved: its readings do not begin with so many equal ones that they are half of all."""
+    N, first, equal = s.gate_first.shape[0], s.gate_first[0, READING, l], 1
+    while (equal < N) and (s.gate_first[equal, READING, l] == first):
         equal += 1
-    return equal
-
-
-@kernel
-def comes_again(s: State, l: int) -> bool:
-    """Whether the reading of the beginning comes again: a rest does, codes of a start are over."""
-    again = False
-    for k in range(beginning(s, l), s.gate_first.shape[0]):
-        again |= s.gate_first[k, READING, l] == s.gate_first[0, READING, l]
-    return again
+    return (first == first) & ((equal == 1) | (2 * (equal + s.phi.shape[0]) < N))  # type: ignore[no-any-return]
 
 
 @partial(kernel, short=True)
-def decide(s: State, ages: int, implicit: bool, l: int) -> None:
+def decide(s: State, ages: int, implicit: bool) -> None:
     """Where samples made room for others they were judged one by one, unless they are the codes themselves."""
-    dropped, s.gate_decided[l] = -s.gate_decided[l], 1
-    some = judge_each(s, implicit, l)
-    whole = (dropped == 0) | (s.gate_doubt[0, l] == 1.0) & (not comes_again(s, l))
-    if some & whole and contradicted(s, l):
-        mark(s, ages, l)
-        s.gate_replay[l] = 1 + dropped
-
-
-@kernel
-def comes_once_more(s: State, k: int, l: int) -> bool:
-    """Whether the present sample is that kept as number k once more."""
-    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    same = (reading_now(s, l) == s.gate_first[k, READING, l]) & (s.dt[l] == s.gate_first[k, DT, l])
-    same &= (s.noise[l] == s.gate_first[k, NOISE, l]) & (s.drift[l] == s.gate_first[k, DRIFT, l])
-    for j in range(PHI - U):
-        same &= s.u[j, l] == s.gate_first[k, U + j, l]
-    for i in range(n):
-        same &= s.phi[i, l] == s.gate_first[k, PHI + i, l]
-    return same  # type: ignore[no-any-return]
-
-
-@kernel
-def keep(s: State, k: int, times: float, l: int) -> None:
-    n, PHI = s.phi.shape[0], s.gate_first.shape[1] - s.phi.shape[0]
-    s.gate_first[k, Y, l] = s.y[l] if s.ok[l] > 0.0 else np.nan
-    s.gate_first[k, READING, l], s.gate_first[k, DT, l] = reading_now(s, l), s.dt[l]
-    s.gate_first[k, NOISE, l], s.gate_first[k, DRIFT, l] = s.noise[l], s.drift[l]
-    s.gate_first[k, TIMES, l] = times
-    for j in range(PHI - U):
-        s.gate_first[k, U + j, l] = s.u[j, l]
-    for i in range(n):
-        s.gate_first[k, PHI + i, l] = s.phi[i, l] if s.valid[l] > 0.0 else np.nan
+    dropped, whole, found = -s.gate_decided[0], True, False
+    for l in range(s.gate_decided.shape[0]):
+        judge_each(s, implicit, l)
+        whole &= (dropped == 0) | (s.gate_doubt[0, l] == 1.0)
+    for l in range(s.gate_decided.shape[0]):
+        found |= mark(s, ages, l) & whole
+    for l in range(s.gate_decided.shape[0]):
+        s.gate_decided[l], s.gate_replay[l] = 1, 1 + dropped if found else 0
 
 
 @partial(kernel, short=True)
-def remember_one(s: State, ages: int, implicit: bool, l: int) -> None:
-    N = s.gate_first.shape[0]
-    last = s.gate_kept[l] - 1
-    if last >= 0 and comes_once_more(s, last, l):
-        keep(s, last, s.gate_first[last, TIMES, l] + 1.0, l)
-        return
-    if s.gate_kept[l] == N:
-        known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-        s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
-        for k in range(1, N):  # the oldest makes room
-            for column in range(s.gate_first.shape[1]):
-                s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
-        s.gate_kept[l] = N - 1
-    keep(s, s.gate_kept[l], 1.0, l)
-    s.gate_kept[l] += 1
-    known = s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
-    equal = beginning(s, l) if (s.gate_kept[l] == N) & known else N
-    if (equal == 1) | (2 * (equal + s.phi.shape[0]) < N):
-        decide(s, ages, implicit, l)
-
-
-def first_samples(implicit: bool) -> Callable[[State, int, int], None]:
-    """``remember(s, ages, l)``: keep the sample and decide when there are enough; inputs stay for ``ages`` samples."""
-
-    @kernel
-    def remember(s: State, ages: int, l: int) -> None:
-        if s.gate_decided[l] < 1:
-            remember_one(s, ages, implicit, l)
-
-    return remember  # type: ignore[no-any-return]
+def remember(s: State, ages: int, implicit: bool) -> None:
+    """Keep the sample, of all outputs, and decide once one of them moved; inputs stay for ``ages`` samples."""
+    N, width, L = s.gate_first.shape
+    last, again, known, moved = max(s.gate_kept[0] - 1, 0), s.gate_kept[0] > 0, False, False
+    for l in range(L):
+        known |= s.gate_first[0, READING, l] == s.gate_first[0, READING, l]
+        for column in range(READING, width):
+            again &= present(s, column, l) == s.gate_first[last, column, l]
+    full = (s.gate_kept[0] == N) & (not again)
+    last = last if again | full else s.gate_kept[0]
+    for l in range(L):
+        if full:
+            s.gate_decided[l] -= int(s.gate_first[0, TIMES, l]) if known else 0
+            for k in range(1, N):  # the oldest makes room
+                for column in range(width):
+                    s.gate_first[k - 1, column, l] = s.gate_first[k, column, l]
+        s.gate_kept[l] = last + 1
+        s.gate_first[last, TIMES, l] = s.gate_first[last, TIMES, l] + 1.0 if again else 1.0
+        for column in range(READING, width):
+            s.gate_first[last, column, l] = present(s, column, l)
+        moved |= (last + 1 == N) & enough(s, l)
+    if moved:
+        decide(s, ages, implicit)

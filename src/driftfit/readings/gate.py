@@ -10,13 +10,12 @@ variance of it, a sample contradicts its forecast, and its reading is far beside
 where (y_hat - m)^2 takes the place of v if it is larger than RARE^2 v: a response that is itself unusual, as that to a
 pulse, may be FAR times as large as predicted. A far reading is refused. A change is not a fault, however:
 
-    a run      the third sample in a row that contradicts is believed, whatever its size; each that agrees with the
-               forecast, by the errors of a settled tracker, counts the run down
+    a run      the third sample in a row that contradicts is believed, whatever its size. One that contradicts counts
+               twice as much as one between that agrees; after a change as many must agree until the count is small
     pulses     of far responses to rare pulses, and of readings far from a signal that never moved, the third is
                believed, whatever lies between
     codes      come in runs: a far reading that repeats one of the last two far ones in all digits, with either sign,
-               is not counted, and believed only with the `hold`-th; with `LONGER` times as many if the forecast moved
-               meanwhile, so that a level would not have repeated, and readings do not repeat by nature
+               is not counted, and believed only with the `hold`-th
 
 s = inf or NaN (start) contradicts nothing, a tracker without s is lent the mean of e^2, and a sample without a forecast
 is judged by v alone. v counts a reading that contradicts its forecast as `CLIPPED` variances at most, so that spikes do
@@ -41,7 +40,7 @@ import numpy as np
 from driftfit.engine.kernel import State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.settings import Settings, numbers, whole
-from driftfit.readings.first_samples import first_samples, no_samples
+from driftfit.readings.first_samples import no_samples, remember
 from driftfit.readings.inputs import input_rules, no_inputs, taking_out
 from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unresolved
 
@@ -51,10 +50,6 @@ MEMORY = 1000.0
 """Their memory, in readings; exponential."""
 CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
-LONGER = 4
-"""Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
-GROWTH = 1.02
-"""Growth in one sample of the error of a settled tracker, at most."""
 USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
 """Reasons: what was decided of a sample."""
 SIGNAL = 8
@@ -92,45 +87,37 @@ class Gate(Settings):
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
 
-def start(gate: Gate, n: int, m: int) -> Mapping[str, Any]:
-    """Fields of the gate's state and their values before the first sample, for n parameters and m inputs."""
+def start(gate: Gate, n: int, m: int, shifts: bool = False) -> Mapping[str, Any]:
+    """Fields of the gate's state before the first sample, for n parameters and m inputs (`no_samples`)."""
     return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
-        "gate_settled": np.inf, "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
+        "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
         "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0,
-        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m),
+        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m, shifts),
     }  # fmt: skip
 
 
-def usual_rule(clip: float, lends: bool) -> Callable[[State, bool, bool, float, float, int], None]:
-    """``learn(s, seen, contradicts, own, v, l)``: mean and variance of the readings, the mean of e^2 / own of the
-    samples used, and the error of a settled tracker, which is compared with v."""
-
-    @kernel
-    def learn(s: State, seen: bool, contradicts: bool, own: float, v: float, l: int) -> None:
-        known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
-        s.gate_count[l] += 1.0 if seen else 0.0
-        share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
-        if seen:
-            off = measured(s, l) - s.gate_mean[l]
-            if contradicts & known:
-                most = np.sqrt(CLIPPED * spread)
-                off = min(max(off, -most), most)
-            s.gate_mean[l] += share * off
-            s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
-        if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-            # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
-            e2 = min(s.e[l] * s.e[l], np.inf if lends & (not known) else clip * v)
-            s.gate_ratio[l] += share * (e2 / own - s.gate_ratio[l])
-            s.gate_settled[l] = min(v, GROWTH * s.gate_settled[l]) if known else np.inf
-
-    return learn  # type: ignore[no-any-return]
+@kernel
+def learn(s: State, seen: bool, contradicts: bool, own: float, most: float, l: int) -> None:
+    """Mean and variance of the readings, and the mean of e^2 / own, e^2 at ``most`` that, of the samples used."""
+    known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
+    s.gate_count[l] += 1.0 if seen else 0.0
+    share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
+    if seen:
+        off = measured(s, l) - s.gate_mean[l]
+        if contradicts & known:
+            clip = np.sqrt(CLIPPED * spread)
+            off = min(max(off, -clip), clip)
+        s.gate_mean[l] += share * off
+        s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
+    if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
+        s.gate_ratio[l] += share * (min(s.e[l] * s.e[l], most) / own - s.gate_ratio[l])
 
 
 def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
-    sure, believed, hold = float(gate.sure) ** 2, gate.believed, gate.hold
+    sure, believed, change, hold = float(gate.sure) ** 2, gate.believed, 2 * gate.believed - 1, gate.hold
 
     @kernel
     def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
@@ -142,16 +129,13 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
         if (apart == 0.0) | turns:
             s.gate_same[l] += 1
             s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            # a level does not repeat where the forecast is elsewhere
-            told = (s.gate_stuck[l] > 0.5) & (not natural(s, l))
-            longest = LONGER * hold if told else hold
-            return (s.gate_same[l] < longest) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+            return (s.gate_same[l] < hold) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
         alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
-        s.gate_run[l] += 1
+        s.gate_run[l] += 2
         s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
         s.gate_other[l] = s.gate_last[l]
         s.gate_last[l] = y
-        return (s.gate_run[l] < believed) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+        return (s.gate_run[l] < change) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
 
     @kernel
     def judge(s: State, v: float, l: int) -> bool:
@@ -164,29 +148,20 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
         beyond = off * off > far * (response * response if unusual else spread)
         contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
-            settled = predicted & (e2 <= sure * s.gate_settled[l])
-            s.gate_run[l] = max(min(s.gate_run[l], 2 * believed) - 1, 0) if settled else s.gate_run[l]
+            s.gate_run[l] = max(min(s.gate_run[l], 2 * change) - 1, 0)
             if s.gate_same[l] > 0:  # a level that repeats is not frozen either
                 s.gate_stuck[l], s.gate_same[l] = BELIEVED, 0
         elif beyond & (s.gate_count[l] >= FIRST):
             if held_back(s, y, unusual, l):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
-            elif s.gate_same[l] > 0:
-                s.gate_stuck[l] = BELIEVED
+            else:
+                s.gate_run[l] = 2 * change
+                s.gate_stuck[l] = BELIEVED if s.gate_same[l] > 0 else s.gate_stuck[l]
         else:
-            s.gate_run[l] += 1
+            s.gate_run[l] += 2
         return contradicts  # type: ignore[no-any-return]
 
     return judge  # type: ignore[no-any-return]
-
-
-def _each_lane(step: Step) -> Any:
-    @partial(kernel, inline=False)
-    def each(s: State) -> None:
-        for l in range(s.reason.shape[0]):
-            step(s, l)
-
-    return each
 
 
 @lru_cache(maxsize=256)
@@ -201,20 +176,17 @@ def gate_step(
     predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
     e^2 takes the place of s, which the tracker does not have.
     """
-    remember = first_samples(implicit)
     notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
     far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
-    learn = usual_rule(sure, lends)
 
     @kernel
     def step(s: State, l: int) -> None:
         ages, s.reason[l] = s.reason[l], USED
         s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
         seen = s.observed[l] > 0.0
-        remember(s, ages, l)
         notice(s, ages, s.gate_count[l] >= FIRST, l)
         off, y_hat, e, variance = measured(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
         if curved and off * off > far * s.gate_variance[l]:
@@ -232,11 +204,19 @@ def gate_step(
                 contradicts = judge(s, v, l)
         resolve(s, l)
         s.reading[l] = measured(s, l) if seen else s.reading[l]
-        learn(s, seen, contradicts, own, v, l)
+        # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
+        most = np.inf if lends & (s.gate_count[l] < FIRST) else sure * v
+        learn(s, seen, contradicts, own, most, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
-    judges, take_out = _each_lane(step), outlined(_each_lane(taking_out(refuse, SIGNAL)), short=True)
-    judge_all = judges if curved else outlined(judges)
+    @partial(kernel, inline=False)
+    def judges(s: State) -> None:
+        if s.gate_decided[0] < 1:
+            remember(s, s.reason[0], implicit)
+        for l in range(s.reason.shape[0]):
+            step(s, l)
+
+    judge_all, take_out = judges if curved else outlined(judges), outlined(taking_out(refuse, SIGNAL), short=True)
 
     @kernel
     def decide(s: State) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, Step, kernel
+from driftfit.engine.kernel import State, kernel
 
 LONGEST = 60
 """Samples that a mask of 64 bits can hold."""
@@ -83,16 +83,16 @@ def input_rules(gate: Any) -> tuple[Any, Any]:
     return notice, blame
 
 
-def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Step:
-    """``take_out(s, l)``: the model refuses inputs that were outside, if the reason is one, from ``blamed`` on."""
+def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Any:
+    """``take_out(s)``: the model refuses inputs that were outside, if the reason is one, from ``blamed`` on."""
 
     @kernel
-    def take_out(s: State, l: int) -> None:
-        if s.reason[l] >= blamed:
-            for j in range(s.gate_low.shape[0]):
+    def take_out(s: State) -> None:
+        for l in range(s.reason.shape[0]):
+            for j in range(s.gate_low.shape[0] if s.reason[l] >= blamed else 0):
                 for age in range(LONGEST, -1, -1):
                     if (s.gate_outside[j, l] >> age) & 1 > 0:
                         refuse(s, j, age, l)
                 forget(s, j, l)
 
-    return take_out  # type: ignore[no-any-return]
+    return take_out

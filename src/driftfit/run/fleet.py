@@ -28,10 +28,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, warn
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.columns import COLLECTED, OfRecord, attribute, collect
 from driftfit.run.gating import left_out_of
-from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
+from driftfit.run.lanes import Lane, Lanes, Results, decided_record, names_of, read_results, write_results
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import PROGRESS_SAMPLES, Program, State, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Plain, Track
@@ -257,8 +258,18 @@ class Outputs(KeyedResults, OfRecord):
 
     @cached_property
     def _collected(self) -> Array:
-        """The samples as the tracker received them, with the regressors that all outputs share."""
-        return self.replayed(collect, COLLECTED)
+        """The samples as the trackers received them once all was decided, with the regressors that outputs share."""
+        return self.decided.replayed(collect, COLLECTED)
+
+    @cached_property
+    def decided(self) -> Outputs:
+        """The run without the codes that its gate found among the first samples; see `Track.decided`."""
+        if self.programs[0].gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
+            return self
+        record, starts = decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)])
+        tile, each = tile_of(self.programs, starts), np.arange(len(self.outputs))
+        lanes = Lanes([(self.programs[0].run(tile, record), tile, each, each)], self._lanes.length)
+        return Outputs(self.programs, self.records._replace(y=record.y, u=record.u), lanes, {}, dict(enumerate(starts)))
 
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
@@ -284,9 +295,9 @@ class Outputs(KeyedResults, OfRecord):
     def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
         alone, y, u, lane = self.programs[j].alone, self.y[:, j], self.u, self._lanes[j]
-        left = NOTHING_LEFT_OUT
-        known, names, units = self.record.known.for_output(j), self.labels.u, dict(self.labels.units)
-        if alone is None:
+        known, names, left = self.record.known.for_output(j), self.labels.u, NOTHING_LEFT_OUT
+        units = dict(self.labels.units)
+        if alone is None or self.decided is not self:
             found, names = self._collected, self.names[j]
             alone, known = Program(Regression(names), self.trackers[j]), known.changed(interval=found["dt"][:, j])
             signals = {("y", k): name for k, name in enumerate(self.outputs)}
@@ -295,7 +306,7 @@ class Outputs(KeyedResults, OfRecord):
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:
-                left = left_out_of(lane.written("reason"), y, lane.written("ok") > 0.0, 0, self.programs[j].signals)
+                left = left_out_of(lane.written("reason"), y, self.decided.ok[:, j], 0, self.programs[j].signals)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()
@@ -312,7 +323,9 @@ class Outputs(KeyedResults, OfRecord):
         missing = {reason: c for reason, c in self.record.labels.missing.items() if not reason.startswith(others)}
         labels = replace(self.record.labels, y=self.outputs[j], u=names, missing=missing, units=units)
         record = Record(y, u, known, self.record.time, labels)
-        return Track(alone, record, Lane(out, tile), start, left)
+        made = Track(alone, record, Lane(out, tile), start, left)
+        vars(made).update({} if self.decided is self else {"decided": self.decided[j]})
+        return made
 
     def __contains__(self, output: object) -> bool:
         return output in self.outputs

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -60,44 +60,42 @@ def left_out_of(decided: Array, y: Array, ok: Array, ages: int, names: Sequence[
     return LeftOut(sample, code, y[sample], np.array(names)[signal], refused, unused)
 
 
-def without_start(gate: Gate | None) -> Gate | None:
-    """A gate that does not judge first samples together: those of several outputs cannot be run again alone."""
-    return None if gate is None else replace(gate, first=0)
-
-
 class First(NamedTuple):
-    """The first samples, each as often as it came, up to the present one."""
+    """The first samples of L outputs, each as often as it came, up to the present one."""
 
     y: Array
-    """Readings (k,)."""
+    """Readings (k, L)."""
     u: Array
-    """Inputs (k, m); of samples that made room for others NaN."""
+    """Inputs (k, m, L), the same for all outputs; of samples that made room for others NaN."""
     known: Array
-    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3)."""
+    """Intervals since the sample before, factors of the noise variance and of the drift (k, 3, L)."""
     codes: Array
-    """Which signals (k, 1 + m), the output first, are codes."""
+    """Which signals (k, 1 + m, L), the output first, are codes."""
     reason: Array
-    """What was decided (k,), as a gate stores it."""
+    """What was decided (k, L), as a gate stores it."""
 
     def without_codes(self) -> tuple[Array, Array]:
-        """(readings (k,), inputs (k, m)), NaN where they are codes."""
+        """(readings (k, L), inputs (k, m, L)), NaN where they are codes."""
         return np.where(self.codes[:, 0], np.nan, self.y), np.where(self.codes[:, 1:], np.nan, self.u)
 
 
-def replayed(lane: Mapping[str, Array], m: int) -> First:
-    """The first samples of a lane with ``gate_replay`` set, given the fields of its state."""
-    rows, dropped = np.array(lane["gate_first"][: int(lane["gate_kept"])]), int(lane["gate_replay"]) - 1
+def replayed(tile: Array, m: int) -> First:
+    """The first samples of a tile with ``gate_replay`` set; an input is a code if it is one for some output."""
+    kept, dropped = tile["gate_kept"].item(0), tile["gate_replay"].item(0) - 1
+    rows = tile["gate_first"][0, :kept].copy()
     rows[0, TIMES] += dropped
-    rows = np.repeat(rows, rows[:, TIMES].astype(int), axis=0)
+    rows = np.repeat(rows, rows[:, TIMES, 0].astype(int), axis=0)
     rows[:dropped, U : U + m] = np.nan
-    codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)) % 2 == 1
-    return First(rows[:, READING], rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros(len(rows)))
+    codes = (rows[:, [CODES]].astype(int) >> np.arange(1 + m)[:, None]) % 2 == 1
+    codes[:, 1:] = codes[:, 1:].any(axis=2, keepdims=True)
+    y = rows[:, READING]
+    return First(y, rows[:, U : U + m], rows[:, [DT, NOISE, DRIFT]], codes, np.zeros_like(y))
 
 
 def without_codes(record: Record, last: int, first: First) -> Record:
     """A record without the codes that were found among its first samples, at sample ``last``."""
     count = min(last + 1, len(first.y))
     part = slice(last + 1 - count, last + 1)
-    y, u = record.y.copy(), record.u.copy()
-    y[part], u[part] = (signal[-count:] for signal in first.without_codes())
+    y, u, (outputs, inputs) = record.y.copy(), record.u.copy(), first.without_codes()
+    y[part], u[part] = outputs[-count:].reshape(count, *y.shape[1:]), inputs[-count:, :, 0]
     return replace(record, y=y, u=u)

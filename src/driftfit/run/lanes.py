@@ -15,13 +15,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.record import Known, Labels, Records
+from driftfit.data.record import Known, Labels, Record, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
 from driftfit.readings.left_out import LeftOut
-from driftfit.run.program import Program, State, kept, programs_of, state_of
+from driftfit.run.gating import First, without_codes
+from driftfit.run.program import Program, State, kept, lanes_of, programs_of, state_of, tile_of
 from driftfit.trackers.base import Tracker
 
 
@@ -96,6 +97,23 @@ class Lanes:
         return map(self.__getitem__, np.flatnonzero(self.done).tolist())
 
 
+def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
+    """One tracker, or the tracker of each output by its name."""
+    return trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
+
+
+def decided_record(
+    programs: Sequence[Program], record: Record, starts: Sequence[State]
+) -> tuple[Record, Sequence[State]]:
+    """(the record without the codes that a gate finds among its first samples, the fields with which its lanes then
+    begin), given the programs of the lanes and the fields with which they began."""
+    found: list[tuple[int, First]] = []
+    tile = tile_of(programs, starts)
+    programs[0].drivers().run(tile, *lanes_of(record), programs[0].written(tile, len(record)), found_too=found)
+    begun = [{**start, "gate_decided": np.array(1)} for start in starts or [{}] * len(programs)]
+    return without_codes(record, *found[0]), begun
+
+
 class Results(NamedTuple):
     """What a file holds: a program, and perhaps a lane and a start, for each output of each series of ``records``."""
 
@@ -160,10 +178,12 @@ def _results(
     for g in range(header["groups"]):
         storage.check_size(path, model, trackers[0], arrays[f"out{g}_theta"].shape[-1])
     gates = [False if gate is None else Gate.from_settings(gate) for gate in header["gates"]]
-    kinds = zip(trackers, gates, strict=True)
-    made = [programs_of(model, tracker, header["inputs"], gate) for tracker, gate in kinds]
-    outputs = tuple(header["outputs"])
-    programs = tuple(made[k][j % max(len(outputs), 1)] for j, k in enumerate(header["tracker"]))
+    outputs, numbers = tuple(header["outputs"]), header["tracker"]
+    ny = max(len(outputs), 1)
+    series = [tuple(numbers[j : j + ny]) for j in range(0, len(numbers), ny)]
+    own = {kinds: by_output(model, [trackers[k] for k in kinds]) for kinds in series}
+    made = {kinds: programs_of(model, tracker, header["inputs"], gates[kinds[0]]) for kinds, tracker in own.items()}
+    programs = tuple(program for kinds in series for program in made[kinds])
     failed, dropped, missing = (
         {_key(key): value for key, value in header[name]} for name in ("failed", "dropped", "missing")
     )

@@ -105,7 +105,9 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
     for k, program in enumerate(programs):
         group = kinds.get(id(program))
         if group is None:
-            group = kinds[id(program)] = groups[program.steps, program.tracker.outputs, program.shapes]
+            group = kinds[id(program)] = groups[
+                program.steps, program.tracker.outputs, program.shapes, program.gate and program
+            ]
         group.append(k)
     return list(groups.values())
 

@@ -28,7 +28,7 @@ from driftfit.models.regression import Regression
 from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
 from driftfit.readings.gate import start as gate_start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import First, foreseeing, gate_of, replayed, without_start
+from driftfit.run.gating import First, foreseeing, gate_of, replayed
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -43,8 +43,6 @@ SINGLE_BLOCK = 4096
 
 WIDEST_LANES = 10
 """Parameters above which loops over lanes are slower than single lanes (docs/decisions/vectorisation.md)."""
-
-_NOTHING: tuple[Array, ...] = ()
 
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
@@ -82,6 +80,8 @@ class Program:
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
     gate: Gate | None = None
     """What decides which readings are used; None: all."""
+    trackers: tuple[Tracker, ...] = ()
+    """Those of all outputs, if each of several has a lane."""
 
     def __post_init__(self) -> None:
         if (self.model.hidden is not None) != self.tracker.follows_states:
@@ -92,7 +92,7 @@ class Program:
 
     def __reduce__(self) -> Any:
         """Copies, and programs sent to another process, are made from the fields."""
-        return Program, (self.model, self.tracker, self.output, self.shared, self.gate)
+        return Program, (self.model, self.tracker, self.output, self.shared, self.gate, self.trackers)
 
     @property
     def whole(self) -> Model:
@@ -145,7 +145,7 @@ class Program:
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         if self.gate is None:
             return own
-        begun = gate_start(self.gate, self.model.n, self.model.m)
+        begun = gate_start(self.gate, self.model.n, self.model.m, self.model.linearised is not None)
         return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
 
     @property
@@ -251,7 +251,7 @@ class Program:
                 found_too.append((done - 1, found))
             if "reason" in (out.dtype.names or ()) and theta is NOWHERE:
                 count = min(done, len(found.reason))
-                out["reason"][done - count : done, 0] = found.reason[-count:]
+                out["reason"][done - count : done] = found.reason[-count:]
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
             if theta is NOWHERE:
@@ -262,14 +262,14 @@ class Program:
 
     def replay(self, tile: Array) -> First:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
-        first = replayed(state_of(tile), self.model.m)
-        fresh = self.tile({"gate_decided": np.array(1)})
-        (y, u), coded, out = first.without_codes(), first.codes.any(axis=1), self.written(fresh, len(first.y))
-        self.drivers().run(fresh, y[:, None], u[:, :, None], first.known[:, :, None], out)
-        fresh["gate_refused"][0, 0] = np.sum(coded)
+        each = zip(self.trackers, self.model.outputs, strict=False)
+        lanes = [replace(self, tracker=tracker, output=name) for tracker, name in each] or [self]
+        first, fresh = replayed(tile, self.model.m), tile_of(lanes, [{"gate_decided": np.array(1)}] * len(lanes))
+        coded, out = first.codes.any(axis=1), self.written(fresh, len(first.y))
+        self.drivers().run(fresh, *first.without_codes(), first.known, out)
+        fresh["gate_refused"][0] = np.sum(coded, axis=0)
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        reason = np.where(coded, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"][:, 0])
-        return first._replace(reason=reason)
+        return first._replace(reason=np.where(coded, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"]))
 
     @property
     def width(self) -> int:
@@ -339,9 +339,9 @@ class Program:
         the cache.
         """
         keep, rows = _driven(tile.dtype, self.outputs, out.dtype)
-        run, last = self.drivers(keep).run, _NOTHING
+        run, last = self.drivers(keep).run, list[Array]()
         if out.dtype.names == ("theta",):  # the driver writes theta, and the rest of a sample over that of the last one
-            last, out, rows = (np.empty(1, rows),), out["theta"], rows["theta"]
+            last, out, rows = [np.empty(1, rows)], out["theta"], rows["theta"]
         if out.dtype == rows.base:
             run(tile, y, u, known, *last, out)
             return
@@ -466,7 +466,7 @@ def programs_of(
         return (Program(_row_model(model, tracker, inputs), tracker, shared=model),)
     bound = model.bind(inputs)
     programs = tuple(
-        Program(bound, one, name, gate=without_start(gate_of(one, gate)))
+        Program(bound, one, name, gate=gate_of(one, gate), trackers=trackers)
         for one, name in zip(trackers, model.outputs, strict=True)
     )
     if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:

@@ -17,8 +17,8 @@ from driftfit.models.base import Model
 from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.run.columns import OfRecord, attribute
-from driftfit.run.gating import First, left_out_of, without_codes
-from driftfit.run.lanes import Lane, Lanes, Results, names_of, read_results, write_results
+from driftfit.run.gating import left_out_of
+from driftfit.run.lanes import Lane, Lanes, Results, decided_record, names_of, read_results, write_results
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.warm_start import End
@@ -275,12 +275,8 @@ class Track(Plain, OfRecord):
         """The run without the codes that its gate found among the first samples, for smoothers and judgements."""
         if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
             return self
-        found: list[tuple[int, First]] = []
-        tile = self.fresh()
-        out = self.program.written(tile, len(self))
-        self.program.drivers().run(tile, *lanes_of(self.record), out, found_too=found)
-        begun = {**(self.start or {}), "gate_decided": np.array(1)}
-        return track_record(self.program, without_codes(self.record, *found[0]), start=begun)
+        record, (start,) = decided_record([self.program], self.record, [self.start or {}])
+        return track_record(self.program, record, start=start)
 
     @cached_property
     def used_record(self) -> Record:

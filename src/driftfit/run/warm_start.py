@@ -21,6 +21,7 @@ from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.readings.gate import Gate
+from driftfit.run.lanes import by_output
 from driftfit.run.layout import own_words, packed, unpacked
 from driftfit.run.program import Program, State, programs_of, state_of, tile_of
 from driftfit.trackers.base import Tracker
@@ -110,11 +111,6 @@ def gate_from(header: Mapping[str, Any]) -> Gate | None:
     """The gate of a header; None for none."""
     given = header["gate"]
     return None if given is None else Gate.from_settings(given)
-
-
-def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
-    """One tracker, or the tracker of each output by its name."""
-    return trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
 
 
 def restore(source: str, programs: Sequence[Program], arrays: Mapping[str, Array], tile: Array) -> None:

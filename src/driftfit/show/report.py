@@ -37,10 +37,8 @@ from driftfit.show.text import counts, digits, key_text
 from driftfit.use.system import dc_gain, largest_pole
 
 if TYPE_CHECKING:
-    from driftfit.engine.kernel import Array
     from driftfit.judge.alarms.detect import Alarms
     from driftfit.judge.alarms.fleet_alarms import ManyAlarms
-    from driftfit.run.result import Track
 
 
 def report(

@@ -29,6 +29,9 @@ Student's (`driftfit.trackers.student`). Every filter starts from generalised le
 drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
 Scaling inputs or outputs changes only the units.
 
+``volatility`` makes log r a random walk (`driftfit.trackers.forms.volatility`): the number of samples that tell of r,
+its memory and the degrees of freedom, falls between samples, 2 / count <- 2 / count + volatility dt.
+
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` specifies it from the start.
 
@@ -47,7 +50,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, nothing
-from driftfit.engine.settings import whole
+from driftfit.engine.settings import numbers, whole
 from driftfit.readings.repeats import note_reading
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.coordinates import (
@@ -195,6 +198,14 @@ def report(s: State, l: int) -> None:
 
 
 @kernel
+def predict_moving(s: State, l: int) -> None:
+    """As before, and log r walks: 2 / count <- 2 / count + volatility dt."""
+    predict(s, l)
+    if s.settled[l] > 0:
+        s.count[l] /= 1.0 + 0.5 * s.volatility[l] * s.dt[l] * s.count[l]
+
+
+@kernel
 def keep_density(o: State, s: State, l: int) -> None:
     o.density[l] = s.density[l]
 
@@ -208,14 +219,18 @@ class AdaptiveKalman(Tracker):
     groups : sequence of sequences of indices, or None
         Parameters that drift together, such as ``[[0, 1], [2]]``: each group has filters in which it alone drifts.
         None: each of up to eight parameters has.
+    volatility : number or None
+        Variance of the change of log r in a nominal sample; positive. None: r has a memory of 70 samples, as with 4e-4
+        and less.
 
     Raises
     ------
     ValueError
-        If an index appears in two groups, or (when it runs) does not exist.
+        If an index appears in two groups, or (when it runs) does not exist, or volatility is not positive.
     """
 
     groups: Any = None
+    volatility: float | None = None
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("density",)
@@ -238,6 +253,9 @@ class AdaptiveKalman(Tracker):
             if len(set(members)) != len(members) or not all(members_of for members_of in groups):
                 raise ValueError(f"AdaptiveKalman: groups must be disjoint and not empty; got {self.groups!r}.")
             self._set("groups", groups)
+        if self.volatility is not None:
+            given = numbers("AdaptiveKalman", "volatility", self.volatility, ndim=0, low=0.0, strict=True)
+            self._set("volatility", given)
 
     def state(self, n: int) -> Mapping[str, Any]:
         beyond = [i for group in self.groups or () for i in group if i >= n]
@@ -259,6 +277,7 @@ class AdaptiveKalman(Tracker):
             **nothing_learned(n),
             **bank(n, self.groups),
             **any_noise(),
+            **({} if self.volatility is None else {"volatility": self.volatility}),
         }
 
     def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
@@ -267,7 +286,7 @@ class AdaptiveKalman(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
-            predict,
+            predict if self.volatility is None else predict_moving,
             forecast,
             correct,
             report,
@@ -318,10 +337,7 @@ class AdaptiveKalman(Tracker):
             facts.append(not_learned(run, names[never]))
         if lately.any():
             facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (
-            *facts,
-            *colour(lane),
-        )
+        return (*facts, *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

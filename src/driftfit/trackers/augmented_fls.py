@@ -28,7 +28,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, no_variance, unknown
 from driftfit.engine.kernel import State, kernel, nothing
-from driftfit.engine.settings import numbers, vector
+from driftfit.engine.settings import check_numbers, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.covariance import prediction
 
@@ -76,10 +76,7 @@ class AugmentedFLS(Tracker):
     required: ClassVar[tuple[str, ...]] = ("mu",)
 
     def __post_init__(self) -> None:
-        if self.mu is not None:
-            self._set("mu", numbers("AugmentedFLS", "mu", self.mu, ndim=0, low=0.0, strict=True))
-        self._set("theta0", numbers("AugmentedFLS", "theta0", self.theta0))
-        self._set("alpha", numbers("AugmentedFLS", "alpha", self.alpha, ndim=0, low=0.0, strict=True))
+        check_numbers(self, (), ("mu", "alpha"), ("theta0",))
         if self.alpha >= 2.0:
             raise ValueError(f"AugmentedFLS: alpha must be in (0, 2), or the recursion diverges; got {self.alpha!r}.")
 

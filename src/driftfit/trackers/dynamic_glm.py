@@ -38,7 +38,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, log, shared
-from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.settings import check_numbers, matrix, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.covariance import LEFT, prediction, read_drift, symmetric_product
 from driftfit.trackers.kalman import drift_matrix
@@ -266,12 +266,7 @@ class DynamicGLM(Tracker):
 
     def __post_init__(self) -> None:
         one_of("DynamicGLM", "family", self.family, FAMILIES)
-        for name in ("q", "p0"):
-            if getattr(self, name) is not None:
-                self._set(name, covariance("DynamicGLM", name, getattr(self, name)))
-        self._set("theta0", numbers("DynamicGLM", "theta0", self.theta0))
-        for name in ("alpha", "r"):
-            self._set(name, numbers("DynamicGLM", name, getattr(self, name), ndim=0, low=0.0, strict=True))
+        check_numbers(self, ("q", "p0"), ("alpha", "r"), ("theta0",))
 
     def state(self, n: int) -> Mapping[str, Any]:
         return {

@@ -36,7 +36,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
+from driftfit.engine.settings import check_numbers, matrix, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.forms import second_differences
@@ -128,9 +128,7 @@ class FLS(Tracker):
     def __post_init__(self) -> None:
         if self.mu is not None:
             self._set("mu", price(self.mu))
-        self._set("theta0", numbers("FLS", "theta0", self.theta0))
-        if self.p0 is not None:
-            self._set("p0", covariance("FLS", "p0", self.p0))
+        check_numbers(self, ("p0",), (), ("theta0",))
         if self.differences not in (1, 2):
             raise ValueError(f"FLS: differences must be 1 or 2; got {self.differences!r}.")
         if self.differences == 2 and self.p0 is not None:

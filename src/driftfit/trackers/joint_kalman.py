@@ -52,10 +52,10 @@ KNOWN = 1e-14
 
 
 @kernel
-def at_estimate(s: State, l: int) -> None:
-    """The equations are evaluated at z."""
+def evaluate_at(s: State, mean: Array, l: int) -> None:
+    """The equations are evaluated at z (n, L)."""
     for i in range(s.theta.shape[0]):
-        s.point[i, l] = s.theta[i, l]
+        s.point[i, l] = mean[i, l]
 
 
 @kernel
@@ -97,40 +97,52 @@ def moves_are_finite(s: State, hidden: int, l: int) -> bool:
 
 
 @lru_cache
-def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> TrackerSteps:
-    transition, _, output, _ = equations_of(equations, inputs)
+def extended_moving(transition: Step, hidden: int) -> Any:
+    """``move(s, mean, P, l)``: z (n, L) and the lower triangle of its covariance (n, n, L) through the equations."""
 
     @kernel
-    def linear(s: State, i: int, j: int, l: int) -> float:
+    def linear(s: State, P: Array, i: int, j: int, l: int) -> float:
         """Entry (i, j) of F P, for state i."""
-        n, total = s.theta.shape[0], 0.0
-        for k in range(n):
-            total += s.slopes[i, k, l] * (s.P[k, j, l] if j <= k else s.P[j, k, l])
+        total = 0.0
+        for k in range(s.theta.shape[0]):
+            total += s.slopes[i, k, l] * (P[k, j, l] if j <= k else P[j, k, l])
         return total
 
     @kernel
-    def move(s: State, l: int) -> None:
+    def move(s: State, mean: Array, P: Array, l: int) -> None:
         n = s.theta.shape[0]
         first = n - hidden
-        at_estimate(s, l)
+        evaluate_at(s, mean, l)
         transition(s, l)
         if moves_are_finite(s, hidden, l):
             for i in range(hidden):
                 for j in range(n):
-                    s.W[i, j, l] = linear(s, i, j, l)
+                    s.W[i, j, l] = linear(s, P, i, j, l)
             for i in range(hidden):
-                s.theta[first + i, l] = s.next[i, l]
+                mean[first + i, l] = s.next[i, l]
                 for j in range(first):
-                    s.P[first + i, j, l] = s.W[i, j, l]
+                    P[first + i, j, l] = s.W[i, j, l]
                 for j in range(i + 1):
                     total = 0.0
                     for k in range(n):
                         total += s.W[i, k, l] * s.slopes[j, k, l]
-                    s.P[first + i, first + j, l] = total
+                    P[first + i, first + j, l] = total
+
+    return move
+
+
+@lru_cache
+def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> TrackerSteps:
+    transition, _, output, _ = equations_of(equations, inputs)
+    move_both = extended_moving(transition, hidden)
+
+    @kernel
+    def move(s: State, l: int) -> None:
+        move_both(s, s.theta, s.P, l)
 
     @kernel
     def forecast(s: State, l: int) -> None:
-        at_estimate(s, l)
+        evaluate_at(s, s.theta, l)
         output(s, l)
         finite = abs(s.value[l]) < LARGEST
         for i in range(s.theta.shape[0]):

@@ -36,7 +36,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.settings import check_numbers, matrix, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.forms import square_root
@@ -118,13 +118,7 @@ class Kalman(Tracker):
     drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.q is not None:
-            self._set("q", covariance("Kalman", "q", self.q))
-        if self.r is not None:
-            self._set("r", numbers("Kalman", "r", self.r, ndim=0, low=0.0, strict=True))
-        if self.p0 is not None:
-            self._set("p0", covariance("Kalman", "p0", self.p0))
-        self._set("theta0", numbers("Kalman", "theta0", self.theta0))
+        check_numbers(self, ("q", "p0"), ("r", "volatility"), ("theta0",))
         if one_of("Kalman", "form", self.form, ("covariance", "sqrt")) == "sqrt" and self.p0 is not None:
             p0 = np.asarray(self.p0)
             if not (np.linalg.eigvalsh(p0) if p0.ndim == 2 else p0).min() > 0.0:
@@ -132,9 +126,7 @@ class Kalman(Tracker):
                     f'Kalman: with form="sqrt" p0 must be positive definite; got {self.p0!r}. Known parameters need '
                     'form="covariance".'
                 )
-
         if self.volatility is not None:
-            self._set("volatility", numbers("Kalman", "volatility", self.volatility, ndim=0, low=0.0, strict=True))
             for name, value in FIELDS.items():
                 self._set(name, value)
         self._set("laws", laws_of("Kalman", self.laws))

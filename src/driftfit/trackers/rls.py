@@ -43,7 +43,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
-from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.settings import check_numbers, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.covariance import correct as measure
@@ -275,13 +275,9 @@ class Forgetting(Tracker):
 
     def __post_init__(self) -> None:
         owner = type(self).__name__
-        if self.forgetting is not None:
-            self._set("forgetting", numbers(owner, "forgetting", self.forgetting, ndim=0, low=0.0, strict=True))
-            if self.forgetting > 1.0:
-                raise ValueError(f"{owner}: forgetting must be in (0, 1]; got {self.forgetting!r}.")
-        if self.p0 is not None:
-            self._set("p0", covariance(owner, "p0", self.p0))
-        self._set("theta0", numbers(owner, "theta0", self.theta0))
+        check_numbers(self, ("p0",), ("forgetting",), ("theta0",))
+        if self.forgetting is not None and self.forgetting > 1.0:
+            raise ValueError(f"{owner}: forgetting must be in (0, 1]; got {self.forgetting!r}.")
         self._set("c_max", numbers(owner, "c_max", self.c_max, ndim=0, low=1.0))
 
     def state(self, n: int) -> Mapping[str, Any]:

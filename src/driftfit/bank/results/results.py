@@ -143,6 +143,12 @@ class Hypotheses:
         """Number of samples that no leaf allowed; they were not used."""
         return int(self.run.state["counters"][COUNTER.impossible])
 
+    @property
+    def rates(self) -> dict[str, float]:
+        """Prior probability of each change at the next sample: as given, or as learned until the end of the record."""
+        row = self.tracker.array(self.run.model, self.run.state, "chain")[0]
+        return dict(zip(self.tracker.change_names, row.reshape(-1, self.sensors).sum(axis=1).tolist(), strict=True))
+
     @cached_property
     def decisions(self) -> list[Decision]:
         """Decided events, in order; empty for reductions that do not decide."""

@@ -1,11 +1,12 @@
 """A record smoothed over all hypotheses of its bank: path, probabilities and dates of changes, and how far theta moved.
 
 The hypotheses are those of the bank, and none of its decisions or leaves: samples are weighed as the run weighed them,
-and filtered again in both directions by `driftfit.smooth.mixture`. Independent changes are events of one mode; under a
-transition every joint event is a mode. In an interval of k nominal samples the chain takes k steps, of which only the
-last moves theta. Outliers and offsets are a mixture of noises. Sensors whose readings say nothing about theta (additive
-outliers, frozen, your own) depend on earlier readings, so they are no noise: samples at which the run found such a
-fault have no weight. Changes that forget or reset are no random walk, and are refused.
+and filtered again in both directions by `driftfit.smooth.mixture`. Probabilities of changes that the run learned are
+those at its end. Independent changes are events of one mode; under a transition every joint event is a mode. In an
+interval of k nominal samples the chain takes k steps, of which only the last moves theta. Outliers and offsets are a
+mixture of noises. Sensors whose readings say nothing about theta (additive outliers, frozen, your own) depend on
+earlier readings, so they are no noise: samples at which the run found such a fault have no weight. Changes that forget
+or reset are no random walk, and are refused.
 
 The drift of `Bank()` is a guess. The covariance that it gives parameter i is multiplied by a factor f_i, one of
 `FACTORS`: none, or a power of ten. They are found by climbing from the best that is common to all parameters, one step
@@ -172,6 +173,8 @@ class Priors:
         given, self.factors = np.split(known.extra if known.extra.size else plain, [H + self.Hd**2], axis=1)
         self.drift, self.Hm = known.drift, Hm
         P, self.initial = bank.event_probabilities
+        if bank.learns:
+            P = bank.array(run.model, run.state, "chain")
         self.noise_of = [j for j, sensor in enumerate(bank.all_sensors) if not away(sensor)]
         kept = self._without(P.reshape(H, self.Hd, Hm)).reshape(self.Hd, Hm, -1)[:, self.noise_of]
         self.P = kept.reshape(kept.shape[0] * kept.shape[1], -1)

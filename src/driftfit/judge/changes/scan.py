@@ -220,9 +220,9 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
 
 
 @shared
-def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Work) -> float:
-    """The best partitions on cells with up to ``most`` breaks, in noise a; returns the information that is none."""
-    whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
+def prepare(X: Array, problem: Problem, most: int, work: Work) -> float:
+    """The best partitions of `whiten`'s rows on cells with up to ``most`` breaks; returns the information that is none.
+    With the last of these only those of the whole record."""
     edges, m, least = problem.edges, work.cost.shape[0], 0.0
     for j in range(1, m):
         copy(work.C[j - 1], work.C[j])
@@ -235,7 +235,7 @@ def prepare(X: Array, y: Array, problem: Problem, a: Array, most: int, work: Wor
             work.cost[i, j] = cost(X.shape[1], work.C[i], work.C[j], work.G, least) if used else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
-        for j in range(1, m):
+        for j in range(1 if count < most else m - 1, m):
             work.best[count, j] = np.inf
             for i in range(1, j):
                 value = work.best[count - 1, i] + work.cost[i, j]
@@ -379,7 +379,9 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
     for start in range(2 if p > 0 else 1):
         for i in range(p):
             a[i] = found.ar[0, i] if start == 0 else 0.0
-        least, room = prepare(X, y, problem, a, K, work), K
+        if start > 0:
+            whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
+        least, room = prepare(X, problem, K, work), K
         for count in range(1, K + 1):
             if not keep(problem, count, work, a, least, found):
                 room = count - 1
@@ -388,7 +390,8 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
                 residuals(X, y, problem, count, work, least)
                 autoregression(work.v, problem.g, problem.lags, work.H, work.next[count])
         for count in range(1, room + 1 if p > 0 else 1):
-            least = prepare(X, y, problem, work.next[count], count, work)
+            whiten(X.shape[1], X, y, problem.g, problem.lags, work.next[count], work.Z)
+            least = prepare(X, problem, count, work)
             keep(problem, count, work, work.next[count], least, found)
 
 

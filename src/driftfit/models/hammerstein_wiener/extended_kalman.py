@@ -29,7 +29,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import covariance, matrix, numbers, vector
+from driftfit.engine.settings import check_numbers, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -76,12 +76,7 @@ class Minimal(Tracker):
     def _check(self, *variances: str) -> None:
         """Check the settings that both have, and those named, which are nonnegative numbers."""
         owner = type(self).__name__
-        if self.q is not None:
-            self._set("q", covariance(owner, "q", self.q))
-        if self.r is not None:
-            self._set("r", numbers(owner, "r", self.r, ndim=0, low=0.0, strict=True))
-        self._set("p0", covariance(owner, "p0", self.p0))
-        self._set("theta0", numbers(owner, "theta0", self.theta0))
+        check_numbers(self, ("q", "p0"), ("r",), ("theta0",))
         for name in variances:
             self._set(name, numbers(owner, name, getattr(self, name), ndim=0, low=0.0))
 

@@ -217,10 +217,11 @@ class Batched(Stream):
 
     def _note_start(self, sample: int, time: Any, first: First) -> None:
         """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
-        self.left_out, dt, begun = Tally(), first.known[:, 0], sample + 1 - len(first.y)
+        self.left_out, dt, begun = Tally(), first.known[:, 0, 0], sample + 1 - len(first.y)
         times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
-        for k in np.flatnonzero(first.reason).tolist():
-            self._note(begun + k, None if times is None else times[k], first.reason.item(k), first.y.item(k))
+        for k, lane in np.argwhere(first.reason).tolist():
+            at = None if times is None else times[k]
+            self._note(begun + k, at, first.reason.item(k, lane), first.y.item(k, lane), lane)
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

@@ -26,12 +26,13 @@ from driftfit.models.base import Model
 from driftfit.readings.gate import SIGNAL
 from driftfit.readings.left_out import KEPT, SAID, Decision, table
 from driftfit.run.columns import attribute
+from driftfit.run.lanes import by_output
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.result import Plain, burn_in
-from driftfit.run.warm_start import KINDS, End, Run, by_output, carried, ended, gate_from, read, restore, written
+from driftfit.run.warm_start import KINDS, End, Run, carried, ended, gate_from, read, restore, written
 from driftfit.trackers.base import Tracker
 
 KNOWN = ("interval", "noise", "drift")

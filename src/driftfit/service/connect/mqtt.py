@@ -11,7 +11,7 @@ broker. The sink publishes
     topic/event      events
     status           "online" or "offline", retained, with a last will
 
-Sparkplug B (Eclipse, version 3.0) as the payload of MQTT: its protobuf messages, read without a library.
+Sparkplug B (Eclipse, version 3.0) as the payload of MQTT: its protobuf messages.
 
     spBv1.0/GROUP/DDATA/NODE/DEVICE        NBIRTH, DBIRTH, NDATA and DDATA carry metrics; others are not samples
 
@@ -30,8 +30,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from struct import unpack_from
+from functools import cache, partial
 from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
@@ -60,11 +59,12 @@ PREFIX = "spBv1.0"
 BIRTHS, DATA = ("NBIRTH", "DBIRTH"), ("NDATA", "DDATA")
 KNOWN_NODES = 100_000
 """Nodes and devices whose metrics are known."""
-METRICS, TIMESTAMP = 2, 1
-"""Fields of a payload."""
-NAME, ALIAS, WHEN, TYPE, HISTORICAL, NULL = 1, 2, 3, 4, 5, 7
-INT, LONG, FLOAT, DOUBLE, BOOLEAN, STRING = 10, 11, 12, 13, 14, 15
-"""Fields of a metric."""
+METRIC = (
+    "string name 1, uint64 alias 2, uint64 timestamp 3, uint32 datatype 4, bool is_historical 5, bool is_null 7, "
+    "uint32 int_value 10, uint64 long_value 11, float float_value 12, double double_value 13, bool boolean_value 14, "
+    "string string_value 15"
+)
+"""Fields of a metric, with one value at most. Those that are left out are data sets, templates and properties."""
 SIGNED = {1: 8, 2: 16, 3: 32, 4: 64}
 """Bits of the signed types of data, which are sent as unsigned numbers."""
 REBIRTH = b"\x12\x1a\n\x14Node Control/Rebirth \x0bp\x01"
@@ -73,6 +73,28 @@ REBIRTH = b"\x12\x1a\n\x14Node Control/Rebirth \x0bp\x01"
 
 class UnknownAliasError(ValueError):
     """A number of a metric that no birth has declared."""
+
+
+@cache
+def _message() -> Any:
+    """The class of payloads of Sparkplug."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b")
+    payload, metric = (file.message_type.add(name=name) for name in ("Payload", "Metric"))
+    kind = descriptor_pb2.FieldDescriptorProto
+    payload.field.add(name="timestamp", number=1, type=kind.TYPE_UINT64, label=kind.LABEL_OPTIONAL)
+    many = {"type": kind.TYPE_MESSAGE, "label": kind.LABEL_REPEATED, "type_name": ".Metric"}
+    payload.field.add(name="metrics", number=2, **many)
+    metric.oneof_decl.add(name="value")
+    for one in METRIC.split(", "):
+        of, name, number = one.split()
+        own = {"oneof_index": 0} if name.endswith("_value") else {}
+        own |= {"number": int(number), "type": kind.Type.Value(f"TYPE_{of.upper()}"), "label": kind.LABEL_OPTIONAL}
+        metric.field.add(name=name, **own)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("Payload"))
 
 
 class Sparkplug:
@@ -94,18 +116,20 @@ class Sparkplug:
         where = "/".join(filter(None, (PREFIX, group, node, device)))
         names = self._names.get((group, node), {})
         born = kind in BIRTHS
-        metrics, when = _metrics(payload)
+        read = _read(payload)
         if kind == "NBIRTH":
             names = {}
-        names = names | {one[ALIAS]: one[NAME] for one in metrics if born and ALIAS in one and NAME in one}
+        names = names | {
+            one.alias: one.name for one in read.metrics if born and one.HasField("alias") and one.HasField("name")
+        }
         rows: dict[int, dict[str, Any]] = {}
         last = {} if born else dict(self._last.get(where, {}))
-        for one in metrics:
-            name = one.get(NAME) or names.get(one.get(ALIAS, -1))
+        for one in read.metrics:
+            name = one.name or names.get(one.alias if one.HasField("alias") else -1)
             if name is None:
-                raise UnknownAliasError(f"the alias {one.get(ALIAS)} was declared by no birth of {group}/{node}.")
-            rows.setdefault(one.get(WHEN, when), {})[name] = value_of(one)
-            if not one.get(HISTORICAL):
+                raise UnknownAliasError(f"the alias {one.alias} was declared by no birth of {group}/{node}.")
+            rows.setdefault(one.timestamp if one.HasField("timestamp") else read.timestamp, {})[name] = value_of(one)
+            if not one.is_historical:
                 last[name] = value_of(one)
         if len(last) > MESSAGE_FIELDS or (len(self._last) >= KNOWN_NODES and where not in self._last):
             raise ValueError(f"more than {MESSAGE_FIELDS} metrics, or {KNOWN_NODES} nodes and devices.")
@@ -140,78 +164,24 @@ def _samples(topic: str, rows: dict[int, dict[str, Any]], before: dict[str, Any]
     return of_rows(topic, filled)
 
 
-def value_of(metric: dict[int, Any]) -> Any:
+def value_of(metric: Any) -> Any:
     """The value of a metric as a number or text; None if it is null or of another type."""
-    if metric.get(NULL):
+    kind = metric.WhichOneof("value")
+    if metric.is_null or kind is None:
         return None
-    for field in (DOUBLE, FLOAT, INT, LONG):
-        if field in metric:
-            value, bits = metric[field], SIGNED.get(metric.get(TYPE, 0))
-            return value - (1 << bits) if bits and field in (INT, LONG) and value >> (bits - 1) & 1 else value
-    return bool(metric[BOOLEAN]) if BOOLEAN in metric else metric.get(STRING)
+    value, bits = getattr(metric, kind), SIGNED.get(metric.datatype, 0)
+    half = 1 << bits >> 1
+    return (value + half) % (2 * half) - half if half and kind in ("int_value", "long_value") else value
 
 
-def _metrics(payload: bytes) -> tuple[list[dict[int, Any]], int]:
-    """(the metrics by field, the time of the message)."""
-    found, when = [], 0
-    for field, value in _fields(payload):
-        if field == METRICS and isinstance(value, bytes):
-            found.append(_metric(value))
-        elif field == TIMESTAMP and isinstance(value, int):
-            when = value
-    return found, when
+def _read(payload: bytes) -> Any:
+    """A payload of Sparkplug."""
+    from google.protobuf.message import DecodeError
 
-
-def _metric(data: bytes) -> dict[int, Any]:
-    metric: dict[int, Any] = {}
-    for field, value in _fields(data):
-        if field in (NAME, STRING):
-            if not isinstance(value, bytes):
-                raise ValueError("a name or text of Sparkplug that is sent as a number.")
-            metric[field] = value.decode("utf-8")
-        elif field in (FLOAT, DOUBLE):
-            if not isinstance(value, bytes) or len(value) != (4 if field == FLOAT else 8):
-                raise ValueError("a number of Sparkplug with the wrong number of bytes.")
-            (metric[field],) = unpack_from("<f" if field == FLOAT else "<d", value)
-        elif isinstance(value, int):  # the others are data sets, templates, properties
-            metric[field] = value
-    return metric
-
-
-def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """(number, value) of the fields of a protobuf message: whole numbers, and bytes for all else."""
-    at = 0
-    while at < len(data):
-        key, at = _varint(data, at)
-        field, wire = key >> 3, key & 7
-        if wire == 0:
-            value, at = _varint(data, at)
-            yield field, value
-            continue
-        if wire == 2:
-            size, at = _varint(data, at)
-        elif wire in (1, 5):
-            size = 8 if wire == 1 else 4
-        else:
-            raise ValueError(f"not protobuf: a field of wire type {wire}.")
-        if at + size > len(data):
-            raise ValueError("a message of Sparkplug that is cut off.")
-        yield field, data[at : at + size]
-        at += size
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """(a whole number, where the next field begins)."""
-    value = 0
-    for shift in range(0, 70, 7):
-        if at >= len(data):
-            raise ValueError("a message of Sparkplug that is cut off.")
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, at
-    raise ValueError("not protobuf: a number of more than ten bytes.")
+    try:
+        return _message().FromString(payload)
+    except DecodeError as error:
+        raise ValueError(f"not a message of Sparkplug: {error}") from None
 
 
 CLOSE_SECONDS = 1.0

@@ -11,57 +11,22 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, kernel, log
 from driftfit.models.state_space import equations_of
 from driftfit.trackers.forms.covariance import LEFT, read_drift
-from driftfit.trackers.joint_kalman import REPEAT_LIMIT, moves_are_finite
+from driftfit.trackers.joint_kalman import REPEAT_LIMIT, evaluate_at, extended_moving
 from driftfit.trackers.state_space.draws import normal, uniform
 
 HALF_LOG_2_PI = 0.9189385332046727
 
 
-@kernel
-def at_particle(s: State, i: int, l: int) -> None:
-    """The equations are evaluated at particle i."""
-    for k in range(s.theta.shape[0]):
-        s.point[k, l] = s.cloud[i, k, l]
-
-
 @lru_cache
 def _moving(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool) -> Any:
-    """``move(s, i, l)``: the states of a particle and their covariance through the equations; lower triangles."""
-    transition = equations_of(equations, inputs).move
-
-    @kernel
-    def linear(s: State, p: int, i: int, j: int, l: int) -> float:
-        """Entry (i, j) of F P, for state i."""
-        total = 0.0
-        for k in range(s.theta.shape[0]):
-            total += s.slopes[i, k, l] * (s.own[p, k, j, l] if j <= k else s.own[p, j, k, l])
-        return total
-
-    @kernel
-    def move(s: State, p: int, l: int) -> None:
-        n = s.theta.shape[0]
-        first = n - hidden
-        at_particle(s, p, l)
-        transition(s, l)
-        if moves_are_finite(s, hidden, l):
-            for i in range(hidden):
-                for j in range(n):
-                    s.W[i, j, l] = linear(s, p, i, j, l)
-            for i in range(hidden):
-                s.cloud[p, first + i, l] = s.next[i, l]
-                for j in range(first):
-                    s.own[p, first + i, j, l] = s.W[i, j, l]
-                for j in range(i + 1):
-                    total = 0.0
-                    for k in range(n):
-                        total += s.W[i, k, l] * s.slopes[j, k, l]
-                    s.own[p, first + i, first + j, l] = total
+    """``move(s, p, l)``: the states of a particle and their covariance through the equations."""
+    move = extended_moving(equations_of(equations, inputs).move, hidden)
 
     @kernel
     def repeated(s: State, p: int, l: int) -> None:
         left = 1.0 if timed else min(max(1.0, s.dt[l]), REPEAT_LIMIT)
         while left > 0.5:
-            move(s, p, l)
+            move(s, s.cloud[p], s.own[p], l)
             left -= 1.0
 
     @kernel
@@ -152,7 +117,7 @@ def _forecast(equations: str, inputs: tuple[str, ...]) -> Any:
     @kernel
     def of_particle(s: State, p: int, l: int) -> bool:
         n = s.theta.shape[0]
-        at_particle(s, p, l)
+        evaluate_at(s, s.cloud[p], l)
         output(s, l)
         finite, v = abs(s.value[l]) < LARGEST, 0.0
         for i in range(n):

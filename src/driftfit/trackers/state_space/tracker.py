@@ -10,7 +10,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import covariance, matrix, near, numbers, vector
+from driftfit.engine.settings import check_numbers, covariance, matrix, near, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.state_space import StateSpace
 from driftfit.trackers.base import Tracker
@@ -37,10 +37,7 @@ class StateSpaceTracker(Tracker):
         owner = type(self).__name__
         for name in ("q", "p0"):
             self._set(name, _named_variances(owner, name, getattr(self, name)))
-        if self.r is not None:
-            self._set("r", numbers(owner, "r", self.r, ndim=0, low=0.0, strict=True))
-        if self.theta0 is not None:
-            self._set("theta0", numbers(owner, "theta0", self.theta0))
+        check_numbers(self, (), ("r",), ("theta0",))
 
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
