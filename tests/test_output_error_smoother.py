@@ -17,7 +17,7 @@ from driftfit import (
 )
 from driftfit.smooth.solvers.simulated import DRIFT, LOST, NOISE, OMEGA, E, Problem, solve
 from driftfit.systems import RandomWalk
-from driftfit.systems.hammerstein_wiener import simulate
+from driftfit.systems.hammerstein_wiener import CUBIC, START, simulate
 from driftfit.use.output_error import Fit, Path, System
 
 WALK = 0.004
@@ -53,7 +53,7 @@ def test_the_linear_problem_is_that_of_dense_algebra():
         return loglik, X @ after, (X @ C @ X.swapaxes(1, 2))[:, na:, na:], after[N + T * n :], after[:N]
 
     v = np.array([0.3, 0.2, 0.1, 0.05, 0.4])
-    found = solve(p, v, cov=True)
+    found = solve(p, v)
     for got, wanted in zip((found.loglik, found.z, found.cov, found.omega, found.begin), dense(v), strict=True):
         np.testing.assert_allclose(got, wanted, atol=1e-12)
     slopes = [(dense(v + h)[0] - dense(v - h)[0]) / 2e-5 for h in 1e-5 * np.eye(5)]
@@ -80,7 +80,7 @@ def test_without_curves_and_lags_it_is_the_linear_smoother():
     y = np.sum(late * (1.0 + 0.03 * np.cumsum(rng.normal(size=(60, 2)), axis=0)), axis=1) + 0.1 * rng.normal(size=60)
     y[20] = np.nan
     system = System(HammersteinWiener(0, 2), u[:, None], (-1.0, 1.0))
-    ones, path = np.ones(60), Path(np.ones((60, 2)), np.zeros(60), np.zeros(0))
+    ones, path = np.ones(60), Path(np.ones((60, 2)), np.zeros(60), np.zeros(1))
     fit = Fit(system, (y, np.where(np.isfinite(y), 1.0, np.inf), np.r_[0.0, ones[1:]]), path, np.array([r, 0.0, *q]))
     linear = track(Regression(2), Kalman(q=q, r=r, p0=np.diag(fit.var[1:] - q), theta0=1.0), y, late)
     np.testing.assert_allclose(fit.path.x, linear.smooth().theta, atol=1e-9)
@@ -128,6 +128,17 @@ def test_drift_and_noise_are_found():
     found = [(output_error(run_of(s)), s) for s in (record(1000, seed, snr_db=25.0) for seed in range(3))]
     np.testing.assert_allclose(np.mean([one.r**0.5 / s.sigma for one, s in found]), 1.0, rtol=0.05)
     np.testing.assert_allclose(np.mean([np.sqrt(one.q) / WALK for one, _ in found]), 1.0, rtol=0.2)
+
+
+def test_constants_lose_the_bias_of_least_squares():
+    """Section 8 of the specification: at 20 dB least squares is off by .18."""
+    s = simulate(CUBIC, *(START[name] for name in "abcd"), T=5000, rng=np.random.default_rng(0), snr_db=20.0)
+    run = track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
+    found = output_error(run, q=0.0, q_w=0.0)
+    assert np.linalg.norm(run.blocks().xi[-1] - s.xi[-1]) > 0.12
+    assert np.linalg.norm(found.theta[-1] - s.xi[-1]) < 0.02
+    assert np.ptp(found.theta, axis=0).max() < 1e-9
+    np.testing.assert_allclose(found.r**0.5, s.sigma, rtol=0.02)
 
 
 @pytest.fixture(scope="module")

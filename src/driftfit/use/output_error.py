@@ -27,7 +27,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -41,13 +40,11 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.output_error import SLOPE_SHARE
 from driftfit.run.result import Track, burn_in
 from driftfit.show.text import Printed, table_of
-from driftfit.smooth.smoothed import plot_smoothed
-from driftfit.smooth.solvers import simulated
+from driftfit.smooth.smoothed import Bands
 from driftfit.smooth.solvers.simulated import Problem, Solution, recursion, solve
 from driftfit.use.blocks import blocks_of, of_minimal, reflected
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from rich.table import Table
 
 WEAK = 10.0
@@ -61,30 +58,26 @@ STILL = 1e-6
 """Gauss-Newton steps end where the sum of squares falls by less; one unit is half of one in the log-likelihood."""
 RISE = 0.02
 """Variances stay where the log-likelihood rises by less."""
+KNOTS = {PiecewiseLinear: "knots", Sigmoid: "centres"}
+"""The setting of a basis with its knots."""
 
 
 class Path(NamedTuple):
-    """x (T, n), omega (T,), and the w before the record (na,), the last one first."""
+    """x (T, n), omega (T,), and the w before the record (max(na, 1),), the last one first."""
 
     x: Array
     omega: Array
     w: Array
 
-    def moved(self, other: Path, share: float) -> Path:
-        return Path(*(one + share * (two - one) for one, two in zip(self, other, strict=True)))
-
 
 class Simulation(NamedTuple):
-    """w and y (T,), and the derivatives of w by its lags and x, of y by w and x, (T, na + n)."""
+    """w and y (T,); the derivatives of w by its lags and x, of y by w and x, (T, n_w + n); where w is lost (T,)."""
 
     w: Array
     y: Array
     of_w: Array
     of_e: Array
-
-
-KNOTS = {PiecewiseLinear: "knots", Sigmoid: "centres"}
-"""The setting of a basis with its knots."""
+    lost: Array
 
 
 @dataclass(frozen=True)
@@ -105,9 +98,11 @@ class System:
 
     @property
     def names(self) -> tuple[str, ...]:
-        tags = (*self.model.structure.tags, "[y]")
-        knots = [f"knot{k + 1}{tag}" for tag, own in zip(tags, self.free, strict=True) for k in range(len(own))]
-        return (*self.model.called(self.model.structure.minimal_names), *self.model.called(knots))
+        s = self.model.structure
+        pairs = zip((*s.tags, "[y]"), self.free, strict=True)
+        return self.model.called(
+            (*s.minimal_names, *(f"knot{k + 1}{tag}" for tag, own in pairs for k in range(len(own))))
+        )
 
     def of_curves(self, x: Array) -> list[Array]:
         """The knots among one x (n,), of each curve."""
@@ -119,49 +114,39 @@ class System:
                  for one, own in zip((*self.model.bases, self.model.out), self.of_curves(x), strict=True)]  # fmt: skip
         return replace(self.model, input=bases[:-1], output=bases[-1]) if self.knots else self.model
 
-    @property
-    def missing(self) -> Array:
-        """(T,) bool: where a function of an input is not known, so that w is lost."""
-        lost, s = np.zeros(len(self.u), bool), self.model.structure
-        for u, basis, nk, nb in zip(self.u.T, self.model.bases, self.model.delays, s.nb, strict=True):
-            unknown = np.isnan(basis.value(u)).any(axis=1)
-            for j in range(nb):
-                lost |= late(unknown, nk + j)
-        return lost
-
     def __call__(self, path: Path) -> Simulation:
-        model, (T, n) = self.at(path.x[0]), path.x.shape
-        s, x = model.structure, path.x
-        na, spans, nw, at = s.na, s.spans(False), max(s.na, 1), s.n_x
-        a, _, c, d = s.groups(x[:, :at])
+        model, (T, n), x, nw = self.at(path.x[0]), path.x.shape, path.x, len(path.w)
+        s, lost = model.structure, np.zeros(T, bool)
+        spans, at, (a, _, c, d) = s.spans(False), s.n_x, s.groups(x[:, : s.n_x])
         drive, of_w, of_e = path.omega.copy(), np.zeros((T, nw + n)), np.zeros((T, nw + n))
         for i, (own, nk) in enumerate(zip(s.of_inputs(c, s.n_in), model.delays, strict=True)):
             u, basis, more = self.u[:, i], model.bases[i], len(self.free[i])
-            f = np.nan_to_num(np.hstack([basis.for_coefficients(u, own), by_knots(basis, u, own, more)]))
+            f = np.hstack([basis.for_coefficients(u, own), by_knots(basis, u, own, more)])
+            unknown, f = np.isnan(f).any(axis=1), np.nan_to_num(f)
             v = np.sum(f[:, : basis.n] * own, axis=1)
             entries = nw + np.concatenate([spans.c[i], np.arange(at, at + more)])
             for j, b in enumerate(spans.b[i]):
+                lost |= late(unknown, nk + j)
                 of_w[:, nw + b] = late(v, nk + j)
                 of_w[:, entries] += x[:, b, None] * late(f[:, 1:], nk + j)
                 drive += x[:, b] * of_w[:, nw + b]
             at += more
         of_w[:, nw + spans.rest] = -1.0
-        drive -= np.sum(x[:, spans.rest], axis=1)
+        of_w[:, : s.na] = -a
         w = np.concatenate([path.w[::-1], np.empty(T)])
-        recursion(-a, drive, w)
-        of_w[:, :na] = -a
-        for k in range(na):
-            of_w[:, nw + k] = -w[na - 1 - k : na - 1 - k + T]
-        w = w[na:]
-        point = w if self.forward or model.linear else Inverse(model, d, self.span)(w)
-        slope, g = np.sum(model.out.derivative(point) * d, axis=1), model.out.value(point)
-        y, scale = np.sum(g * d, axis=1), np.ones((T, 1))
+        recursion(of_w[:, :nw], drive - np.sum(x[:, spans.rest], axis=1), w)
+        for k in range(s.na):
+            of_w[:, nw + k] = -w[nw - 1 - k : nw - 1 - k + T]
+        w = w[nw:]
+        y = w if self.forward or model.linear else Inverse(model, d, self.span)(w)
+        slope, g, scale = np.sum(model.out.derivative(y) * d, axis=1), model.out.value(y), np.ones(T)
+        of_e[:, 0] = slope
         if not self.forward:
-            y, scale = point, -1.0 / np.maximum(slope, SLOPE_SHARE * model.out.steepness)[:, None]
-        of_e[:, 0] = slope if self.forward else -scale[:, 0]
-        of_e[:, nw + spans.d] = scale * g[:, 1:]
-        of_e[:, nw + at :] = scale * by_knots(model.out, point, d, n - at)
-        return Simulation(w, y, of_w, of_e)
+            of_e[:, 0] = 1.0 / np.maximum(slope, SLOPE_SHARE * model.out.steepness)
+            scale = -of_e[:, 0]
+        of_e[:, nw + spans.d] = scale[:, None] * g[:, 1:]
+        of_e[:, nw + at :] = scale[:, None] * by_knots(model.out, y, d, n - at)
+        return Simulation(w, np.sum(g * d, axis=1) if self.forward else y, of_w, of_e, lost)
 
 
 def by_knots(basis: Basis, x: Array, c: Array, count: int) -> Array:
@@ -180,67 +165,58 @@ class Fit:
 
     def __init__(self, system: System, record: tuple[Array, Array, Array], path: Path, fixed: Array) -> None:
         """``record``: y and the factors of noise and of drift, (T,); ``fixed`` (2 + n,) variances, NaN if unknown."""
-        self.system, (self.y, noise, drift) = system, record
-        self.signals = np.column_stack([np.zeros(len(drift)), noise, drift, np.zeros((len(drift), 2))])
-        self.used = np.isfinite(noise)
-        sim = system(path)
-        T, n = path.x.shape
-        w, x = sim.of_w.shape[1] - n, slice(-n, None)
-        slope = float(np.mean(sim.of_e[:, 0] ** 2)) or 1.0
-        q_w, size = float(np.mean(path.omega**2)), float(np.mean(sim.w**2)) or 1.0
-        r = float(np.mean((self.y - sim.y)[self.used] ** 2)) + slope * q_w
-        r = max(r, LEAST * (float(np.var(self.y[self.used])) or 1.0))
-        effect = np.mean((sim.of_e[:, x] + sim.of_e[:, :1] * sim.of_w[:, x])[self.used] ** 2, axis=0)
+        self.system, (self.y, self.noise, self.drift), sim = system, record, system(path)
+        self.used, n, known = np.isfinite(self.noise), path.x.shape[1], self.y[np.isfinite(self.noise)]
+        slope, size = float(np.mean(sim.of_e[:, 0] ** 2)) or 1.0, float(np.mean(sim.w**2)) or 1.0
+        q_w = float(np.mean(path.omega**2))
+        r = float(np.mean((known - sim.y[self.used]) ** 2)) + slope * q_w
+        r = max(r, LEAST * (float(np.var(known)) or 1.0))
+        gain = sim.of_e[self.used, -n:] + sim.of_e[self.used, :1] * sim.of_w[self.used, -n:]
+        effect = np.mean(gain**2, axis=0)
         effect[effect == 0.0] = slope * size
-        self.signals[system.missing, simulated.LOST] = size
-        self.mean, self.var = path.x[0], np.concatenate([np.full(w, size), WEAK**2 * r / effect])
-        guess = np.concatenate([[r, max(q_w, QUIET * r / slope)], r / (T * effect)])
+        self.mean, self.lost = path.x[0], size * sim.lost
+        self.var = np.concatenate([np.full(len(path.w), size), WEAK**2 * r / effect])
+        guess = np.concatenate([[r, max(q_w, QUIET * r / slope)], r / (len(self.y) * effect)])
         self.free = np.isnan(fixed)
         self.variances = np.where(self.free, guess, fixed)
         self.path, self.sim, self.found = self.minimise(path)
 
-    def tried(self, path: Path) -> tuple[float, Simulation | None]:
-        """The sum of squares over their variances; inf where knots cross or w is unstable."""
-        if any(np.any(np.diff(own) <= 0.0) for own in self.system.of_curves(path.x[0])):
-            return np.inf, None
-        r, q_w, q = self.variances[0], self.variances[1], self.variances[2:]
+    def tried(self, path: Path) -> tuple[float, Simulation]:
+        """The sum of squares over their variances; inf where w is unstable."""
+        (r, q_w), q, nw = self.variances[:2], self.variances[2:], len(path.w)
         with np.errstate(over="ignore", invalid="ignore"):
             sim = self.system(path)
-            total = np.sum((self.y - sim.y)[self.used] ** 2 / self.signals[self.used, simulated.NOISE]) / r
-            for moves, var in (
-                (np.diff(path.x, axis=0), self.signals[1:, simulated.DRIFT, None] * q),
-                (path.omega, q_w + self.signals[:, simulated.LOST]), (path.x[0] - self.mean, self.var[-len(q) :]),
-                (path.w, self.var[: len(path.w)]),
-            ):  # fmt: skip
-                total += np.sum(np.divide(moves**2, var, out=np.zeros_like(moves), where=var > 0.0))
-        return (float(total) if np.isfinite(total) else np.inf), sim
+            squares = (
+                ((self.y - sim.y)[self.used], r * self.noise[self.used]), (path.omega, q_w + self.lost),
+                (np.diff(path.x, axis=0), self.drift[1:, None] * q), (path.w, self.var[:nw]),
+                (path.x[0] - self.mean, self.var[nw:]),
+            )  # fmt: skip
+            total = sum(float(np.sum(off[var > 0.0] ** 2 / var[var > 0.0])) for off, var in squares)
+        return (total if np.isfinite(total) else np.inf), sim
 
-    def linearised(self, sim: Simulation, path: Path, cov: bool = False) -> Solution:
+    def linearised(self, sim: Simulation, path: Path) -> Solution:
         """The smoothed deviation from a path."""
-        signals = self.signals.copy()
-        signals[:, simulated.E], signals[:, simulated.OMEGA] = np.where(self.used, self.y - sim.y, 0.0), -path.omega
-        mean = np.concatenate([np.zeros(len(self.var) - len(self.mean)), self.mean - path.x[0]])
-        mean[: len(path.w)] = -path.w
-        shift = -np.diff(path.x, axis=0, prepend=path.x[:1])
-        return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), self.variances, cov)
+        off = np.where(self.used, self.y - sim.y, 0.0)
+        signals = np.column_stack([off, self.noise, self.drift, self.lost, -path.omega])
+        mean, shift = np.concatenate([-path.w, self.mean - path.x[0]]), -np.diff(path.x, axis=0, prepend=path.x[:1])
+        return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), self.variances)
 
     def minimise(self, path: Path) -> tuple[Path, Simulation, Solution]:
         """Gauss-Newton steps from a path."""
         cost, sim = self.tried(path)
         for _ in range(STEPS):
-            assert sim is not None
             found, before = self.linearised(sim, path), cost
-            x = found.z[:, -path.x.shape[1] :]
-            aim = Path(path.x + x, path.omega + found.omega, path.w + found.begin[: len(path.w)])
+            step = Path(found.z[:, len(path.w) :], found.omega, found.begin[: len(path.w)])
             for k in range(HALVINGS):
-                trial = path.moved(aim, 0.5**k)
+                trial = Path(*(one + 0.5**k * move for one, move in zip(path, step, strict=True)))
+                if any(np.any(np.diff(own) <= 0.0) for own in self.system.of_curves(trial.x[0])):
+                    continue
                 cost, other = self.tried(trial)
                 if cost < before:
                     path, sim = trial, other
                     break
             if not cost < before - STILL:
                 break
-        assert sim is not None
         return path, sim, self.linearised(sim, path)
 
     def estimate(self, rounds: int) -> None:
@@ -251,19 +227,18 @@ class Fit:
             with np.errstate(divide="ignore", invalid="ignore"):
                 factor = np.where(self.free & (found.expected > 0.0), found.moved / found.expected, 1.0)
             self.variances = np.maximum(before * factor**power, least)
-            path, sim, found = self.minimise(self.path)
-            rise = found.loglik - self.found.loglik
+            trial = self.minimise(self.path)
+            rise = trial[2].loglik - found.loglik
             if rise > 0.0:
-                self.path, self.sim, self.found, power = path, sim, found, 1.5 * power
+                (self.path, self.sim, self.found), power = trial, 1.5 * power
             else:
                 self.variances = before
-            if rise < RISE:
-                if power <= 0.75:
-                    break
-                power = 0.5
+            if rise < RISE and power <= 0.75:
+                break
+            power = power if rise >= RISE else 0.5
 
 
-class OutputErrorPath(Printed):
+class OutputErrorPath(Bands, Printed):
     """The most probable path of a Hammerstein-Wiener system, with bands.
 
     Attributes
@@ -285,16 +260,10 @@ class OutputErrorPath(Printed):
 
     def __init__(self, run: Track, fit: Fit) -> None:
         self.run, self.system, self.names = run, fit.system, fit.system.names
-        found = fit.linearised(fit.sim, fit.path, cov=True)
-        self.theta, self.cov, self.loglik = fit.path.x, found.cov, found.loglik
-        self.std = np.sqrt(np.maximum(np.einsum("tii->ti", found.cov), 0.0))
+        self.theta, self.cov, self.loglik = fit.path.x, fit.found.cov, fit.found.loglik
+        self.std = np.sqrt(np.maximum(np.einsum("tii->ti", self.cov), 0.0))
         self.w, self.prediction = fit.sim.w, fit.sim.y
         (self.r, self.q_w), self.q = fit.variances[:2].tolist(), fit.variances[2:]
-
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, n), of the normal distribution about the path."""
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
-        return self.theta - half, self.theta + half
 
     def blocks(self, input: str | None = None, output: str = "d1", at: float = 0.0) -> Blocks:
         """a, b, c and d with standard deviations, as `Track.blocks`, with free knots at their estimates.
@@ -315,10 +284,6 @@ class OutputErrorPath(Printed):
             shown.add_row(name, *ends, f"{self.q[j] ** 0.5:.2g}")
         shown.caption = f"noise {self.r**0.5:.3g} of y, {self.q_w**0.5:.3g} of w; log-likelihood {self.loglik:.1f}"
         return shown
-
-    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
-        """Parameters with bands; a matplotlib figure. ``ax`` as for `Track.plot`."""
-        return plot_smoothed(self.run, self.theta, *self.band(level), ax, self.names)
 
 
 def output_error(
@@ -374,7 +339,9 @@ def output_error(
     n_x = model.structure.n_x
     fixed[2 : 2 + n_x] = vector("output_error", "q", np.nan if q is None else q, n_x)
     xi = _median(run, given, system) if start is None else vector("output_error", "start", start, n_x)
-    path = Path(np.tile(np.concatenate([xi, *system.free]), (len(run), 1)), np.zeros(len(run)), np.zeros(model.na))
+    path = Path(
+        np.tile(np.concatenate([xi, *system.free]), (len(run), 1)), np.zeros(len(run)), np.zeros(max(model.na, 1))
+    )
     paths = [path] if system.forward or q_w == 0.0 else [path, _following(system, record.y, path)]
     fits = [Fit(system, (record.y, noise, drift), one, fixed) for one in paths]
     best = max(fits, key=lambda fit: fit.found.loglik)
@@ -397,9 +364,9 @@ def _median(run: Track, given: HammersteinWiener, system: System) -> Array:
 
 def _following(system: System, y: Array, path: Path) -> Path:
     """The path with the omega that make w the measured level F(y)."""
-    s, T, known = system.model.structure, len(y), np.flatnonzero(np.isfinite(y))
+    T, nw, sim, known = len(y), len(path.w), system(path), np.flatnonzero(np.isfinite(y))
     g = system.at(path.x[0]).out.value(np.interp(np.arange(T), known, y[known]))
-    levels = np.sum(g * s.groups(path.x[:, : s.n_x])[3], axis=1)
-    off = np.concatenate([np.full(s.na, levels[0]), levels - system(path).w])
-    omega = off[s.na :] + sum(path.x[:, i] * off[s.na - 1 - i : s.na - 1 - i + T] for i in range(s.na))
-    return Path(path.x, omega, np.full(s.na, levels[0]))
+    levels = np.sum(g * system.model.structure.groups(path.x[:, : system.model.structure.n_x])[3], axis=1)
+    off = np.concatenate([np.full(nw, levels[0]), levels - sim.w])
+    omega = off[nw:] - sum(sim.of_w[:, i] * off[nw - 1 - i : nw - 1 - i + T] for i in range(nw))
+    return Path(path.x, omega, np.full(nw, levels[0]))

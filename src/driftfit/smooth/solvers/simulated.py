@@ -13,7 +13,7 @@ backward recursion therefore carries the adjoint rho and its variance N (de Jong
 and the derivatives of the log-likelihood by q_j, q_w and r are half of sum(moved - expected): of rho_j^2 - N_jj before
 the time update, rho_w^2 - N_ww after it, and u^2 - D, those of q and r times the factor of the sample.
 
-Sources: de Jong (1988), Koopman and Shephard (1992). Cost: O(T N^2), with covariances O(T N^3); N^2 numbers a sample.
+Sources: de Jong (1988), Koopman and Shephard (1992). Cost: O(T N^3); N^2 numbers a sample.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Problem(NamedTuple):
 
 class Solution(NamedTuple):
     """Means ``z`` (T, N) and ``omega`` (T,) given all samples, ``begin`` (N,) those before the first one; ``moved`` and
-    ``expected`` (2 + n,) by r, q_w and q; ``cov`` (T, n, n) of x, or none; log-likelihood."""
+    ``expected`` (2 + n,) by r, q_w and q; ``cov`` (T, n, n) of x; log-likelihood."""
 
     z: Array
     omega: Array
@@ -65,123 +65,67 @@ def recursion(a: Array, drive: Array, w: Array) -> None:
 
 
 @Driver
-def forwards(p: Problem, v: Array, P: Array, K: Array, z: Array, row: Array) -> float:
-    """The filter: P (T, N, N) and z (T, N) before each sample, K (T, N + 2) with S and the innovation."""
-    T, N = p.of_w.shape
-    n = p.shift.shape[1]
-    nw, total = N - n, 0.0
-    at, now = np.zeros((N, N)), p.mean.copy()
-    for i in range(N):
-        at[i, i] = p.var[i]
+def forwards(p: Problem, v: Array, M: Array, P: Array, K: Array, z: Array) -> float:
+    """The filter: P (T, N, N) and z (T, N) before each sample, K (T, N + 2) with S and the innovation.
+
+    ``M`` (N, N) is the transition, whose first row is that of the sample.
+    """
+    T, N = z.shape
+    nw, total, now, C = N - p.shift.shape[1], 0.0, p.mean.copy(), np.diag(p.var)
     for t in range(T):
-        for j in range(n):
-            now[nw + j] += p.shift[t, j]
-            at[nw + j, nw + j] += v[2 + j] * p.signals[t, DRIFT]
-        own, mean = v[1] + p.signals[t, LOST], p.signals[t, OMEGA]
-        for i in range(N):
-            dot = 0.0
-            for j in range(N):
-                dot += at[i, j] * p.of_w[t, j]
-            row[i] = dot
-            own += dot * p.of_w[t, i]
-            mean += now[i] * p.of_w[t, i]
-        for i in range(nw - 1, 0, -1):
-            now[i] = now[i - 1]
-            for j in range(i, 0, -1):
-                at[i, j] = at[j, i] = at[i - 1, j - 1]
-            for j in range(nw, N):
-                at[i, j] = at[j, i] = at[i - 1, j]
-        for j in range(1, N):
-            at[0, j] = at[j, 0] = row[j - 1] if j < nw else row[j]
-        at[0, 0], now[0] = own, mean
-        S, e = v[0] * p.signals[t, NOISE], p.signals[t, E]
-        for i in range(N):
-            z[t, i] = now[i]
-            dot = 0.0
-            for j in range(N):
-                P[t, i, j] = at[i, j]
-                dot += at[i, j] * p.of_e[t, j]
-            row[i] = dot
-            S += dot * p.of_e[t, i]
-            e -= now[i] * p.of_e[t, i]
-        used = p.signals[t, NOISE] < np.inf
-        K[t, N], K[t, N + 1] = S, e if used else 0.0
-        for i in range(N):
-            K[t, i] = row[i] / S
-        if used:
+        now[nw:] += p.shift[t]
+        for j in range(nw, N):
+            C[j, j] += v[2 + j - nw] * p.signals[t, DRIFT]
+        M[0] = p.of_w[t]
+        now, C = M @ now, M @ C @ M.T
+        now[0] += p.signals[t, OMEGA]
+        C[0, 0] += v[1] + p.signals[t, LOST]
+        z[t], P[t] = now, C
+        h, known = p.of_e[t], p.signals[t, NOISE] < np.inf
+        g = C @ h
+        S, e = h @ g + v[0] * p.signals[t, NOISE], p.signals[t, E] - h @ now if known else 0.0
+        K[t, :N], K[t, N], K[t, N + 1] = g / S, S, e
+        if known:
             total -= 0.5 * (np.log(2.0 * np.pi * S) + e * e / S)
-            for i in range(N):
-                now[i] += K[t, i] * e
-                for j in range(N):
-                    at[i, j] -= K[t, i] * row[j]
+            now, C = now + g * (e / S), C - np.outer(g, g / S)
     return total
 
 
 @Driver
-def backwards(p: Problem, v: Array, P: Array, K: Array, found: Solution, NP: Array) -> None:
+def backwards(p: Problem, v: Array, M: Array, P: Array, K: Array, found: Solution) -> None:
     """Fills ``found``, whose z are those of the filter before."""
-    T, N = p.of_w.shape
+    T, N = found.z.shape
     n = p.shift.shape[1]
-    nw = N - n
-    rho, R, old, NK = np.zeros(N), np.zeros((N, N)), np.zeros(N), np.zeros(N)
+    rho, R = np.zeros(N), np.zeros((N, N))
     for t in range(T - 1, -1, -1):
-        if K[t, N] < np.inf:
-            u, D = K[t, N + 1] / K[t, N], 1.0 / K[t, N]
-            for i in range(N):
-                u -= K[t, i] * rho[i]
-                NK[i] = 0.0
-                for j in range(N):
-                    NK[i] += R[i, j] * K[t, j]
-                D += K[t, i] * NK[i]
-            for i in range(N):
-                rho[i] += p.of_e[t, i] * u
-                for j in range(N):
-                    R[i, j] += p.of_e[t, i] * p.of_e[t, j] * D - p.of_e[t, i] * NK[j] - NK[i] * p.of_e[t, j]
-            found.moved[0] += u * u * p.signals[t, NOISE]
-            found.expected[0] += D * p.signals[t, NOISE]
-        for i in range(N):
-            for j in range(N):
-                found.z[t, i] += P[t, i, j] * rho[j]
-        for k in range(n if len(found.cov) else 0):
-            for i in range(N):
-                NP[i] = 0.0
-                for j in range(N):
-                    NP[i] += R[i, j] * P[t, j, nw + k]
-            for m in range(n):
-                found.cov[t, m, k] = P[t, nw + m, nw + k]
-                for i in range(N):
-                    found.cov[t, m, k] -= P[t, nw + m, i] * NP[i]
-        found.omega[t] = p.signals[t, OMEGA] + (v[1] + p.signals[t, LOST]) * rho[0]
+        signals, h, k, S = p.signals[t], p.of_e[t], K[t, :N], K[t, N]
+        if signals[NOISE] < np.inf:
+            Rk, u = R @ k, K[t, N + 1] / S - k @ rho
+            D = 1.0 / S + k @ Rk
+            rho = rho + h * u
+            R = R + np.outer(h, D * h - Rk) - np.outer(Rk, h)
+            found.moved[0] += u * u * signals[NOISE]
+            found.expected[0] += D * signals[NOISE]
+        found.z[t] += P[t] @ rho
+        found.cov[t] = (P[t] - P[t] @ R @ P[t])[N - n :, N - n :]
+        found.omega[t] = signals[OMEGA] + (v[1] + signals[LOST]) * rho[0]
         found.moved[1] += rho[0] * rho[0]
         found.expected[1] += R[0, 0]
-        for side in range(2):  # R M, then M' (R M), which is symmetric
-            for i in range(N):
-                for j in range(N):
-                    old[j] = R[i, j] if side == 0 else R[j, i]
-                for j in range(N):
-                    up = (old[j + 1] if j + 1 < nw else 0.0) if j < nw else old[j]
-                    if side == 0:
-                        R[i, j] = old[0] * p.of_w[t, j] + up
-                    else:
-                        R[j, i] = old[0] * p.of_w[t, j] + up
-        for j in range(N):
-            old[j] = rho[j]
-        for j in range(N):
-            rho[j] = old[0] * p.of_w[t, j] + ((old[j + 1] if j + 1 < nw else 0.0) if j < nw else old[j])
+        M[0] = p.of_w[t]
+        rho, R = M.T @ rho, M.T @ R @ M
         for j in range(n):
-            found.moved[2 + j] += rho[nw + j] * rho[nw + j] * p.signals[t, DRIFT]
-            found.expected[2 + j] += R[nw + j, nw + j] * p.signals[t, DRIFT]
-    for i in range(N):
-        found.begin[i] = p.mean[i] + p.var[i] * rho[i]
+            found.moved[2 + j] += rho[N - n + j] ** 2 * signals[DRIFT]
+            found.expected[2 + j] += R[N - n + j, N - n + j] * signals[DRIFT]
+    found.begin[:] = p.mean + p.var * rho
 
 
-def solve(p: Problem, variances: Array, cov: bool = False) -> Solution:
+def solve(p: Problem, variances: Array) -> Solution:
     """Solve a problem with ``variances`` (2 + n,): r, q_w, q."""
     T, N = p.of_w.shape
     n = p.shift.shape[1]
-    P, K, z = np.empty((T, N, N)), np.empty((T, N + 2)), np.empty((T, N))
-    loglik = float(forwards(p, variances, P, K, z, np.empty(N)))
-    sums, of_cov = np.zeros((2, 2 + n)), np.zeros((T if cov else 0, n, n))
-    found = Solution(z, np.empty(T), np.empty(N), sums[0], sums[1], of_cov, loglik)
-    backwards(p, variances, P, K, found, np.empty(N))
+    M, P, K, z, sums = np.eye(N), np.empty((T, N, N)), np.empty((T, N + 2)), np.empty((T, N)), np.zeros((2, 2 + n))
+    M[1 : N - n] = np.eye(N - n - 1, N)  # w_{t-1} .. of the state before
+    loglik = float(forwards(p, variances, M, P, K, z))
+    found = Solution(z, np.empty(T), np.empty(N), sums[0], sums[1], np.empty((T, n, n)), loglik)
+    backwards(p, variances, M, P, K, found)
     return found
