@@ -17,9 +17,14 @@ minimum, which is Laplace's approximation. r, q_w and each q_j are multiplied by
 cannot lower the likelihood of the linearised problem; a power of this factor is taken as long as it pays. c of a past
 input is that of its own time, and its step is taken to be that of the present.
 
+Bands are those of larger variances, because the mode of a variance is too small in short records: its mean given y,
+sigma^2 + var(sigma), with sigma normal a priori, of the standard deviation with which it starts, and the curvature of
+the log-likelihood in all sigma. On 24 records of 400 samples the bands of 95 % hold .86 of the truth with the mode,
+.91 with the mean, and .92 if q is known.
+
 Sources: Bell (1994) for the iterated smoother; Tierney and Kadane (1986); Zhou, Hu, Qiao and Lange (2019) for the
 update of variances; Salakhutdinov and Roweis (2003) for its power. The path begins as the median of the coefficients
-of a run; the prior of x_0 is as wide as its influence on y is small. Cost: some 100 passes of O(T (na + n)^2).
+of a run; the prior of x_0 is as wide as its influence on y is small. Cost: some 100 passes of O(T (na + n)^3).
 """
 
 from __future__ import annotations
@@ -56,6 +61,8 @@ QUIET = 1e-4
 STEPS, HALVINGS = 30, 12
 STILL = 1e-6
 """Gauss-Newton steps end where the sum of squares falls by less; one unit is half of one in the log-likelihood."""
+NUDGE = 0.1
+"""Relative step of standard deviations by which the curvature of the likelihood is measured."""
 RISE = 0.02
 """Variances stay where the log-likelihood rises by less."""
 KNOTS = {PiecewiseLinear: "knots", Sigmoid: "centres"}
@@ -178,7 +185,7 @@ class Fit:
         self.var = np.concatenate([np.full(len(path.w), size), WEAK**2 * r / effect])
         guess = np.concatenate([[r, max(q_w, QUIET * r / slope)], r / (len(self.y) * effect)])
         self.free = np.isnan(fixed)
-        self.variances = np.where(self.free, guess, fixed)
+        self.variances = self.start = np.where(self.free, guess, fixed)
         self.path, self.sim, self.found = self.minimise(path)
 
     def tried(self, path: Path) -> tuple[float, Simulation]:
@@ -194,18 +201,18 @@ class Fit:
             total = sum(float(np.sum(off[var > 0.0] ** 2 / var[var > 0.0])) for off, var in squares)
         return (total if np.isfinite(total) else np.inf), sim
 
-    def linearised(self, sim: Simulation, path: Path) -> Solution:
+    def linearised(self, sim: Simulation, path: Path, variances: Array) -> Solution:
         """The smoothed deviation from a path."""
         off = np.where(self.used, self.y - sim.y, 0.0)
         signals = np.column_stack([off, self.noise, self.drift, self.lost, -path.omega])
         mean, shift = np.concatenate([-path.w, self.mean - path.x[0]]), -np.diff(path.x, axis=0, prepend=path.x[:1])
-        return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), self.variances)
+        return solve(Problem(signals, sim.of_w, sim.of_e, shift, mean, self.var), variances)
 
     def minimise(self, path: Path) -> tuple[Path, Simulation, Solution]:
         """Gauss-Newton steps from a path."""
         cost, sim = self.tried(path)
         for _ in range(STEPS):
-            found, before = self.linearised(sim, path), cost
+            found, before = self.linearised(sim, path, self.variances), cost
             step = Path(found.z[:, len(path.w) :], found.omega, found.begin[: len(path.w)])
             for k in range(HALVINGS):
                 trial = Path(*(one + 0.5**k * move for one, move in zip(path, step, strict=True)))
@@ -217,7 +224,7 @@ class Fit:
                     break
             if not cost < before - STILL:
                 break
-        return path, sim, self.linearised(sim, path)
+        return path, sim, self.linearised(sim, path, self.variances)
 
     def estimate(self, rounds: int) -> None:
         """The variances that are free, as many times as the likelihood rises."""
@@ -237,6 +244,21 @@ class Fit:
                 break
             power = power if rise >= RISE else 0.5
 
+    def spread(self) -> Solution:
+        """The solution with the mean of each variance given y, by the curvature of the likelihood."""
+        mode, start, k = np.sqrt(self.variances), np.sqrt(self.start[self.free]), np.flatnonzero(self.free)
+        scores = np.array([self._scored(mode + step)[1] for step in (0.0 * mode, *NUDGE * np.diag(mode)[k])])[:, k]
+        curvature = np.outer(start, start) * (scores[0] - scores[1:]) / (NUDGE * mode[k, None])
+        values, vectors = np.linalg.eigh(np.eye(len(k)) + 0.5 * (curvature + curvature.T))
+        var = np.zeros(len(mode))
+        var[k] = start**2 * np.sum(vectors**2 / np.maximum(values, 1.0), axis=1)
+        return self._scored(np.sqrt(mode**2 + var))[0]
+
+    def _scored(self, sigma: Array) -> tuple[Solution, Array]:
+        """The solution for standard deviations (2 + n,), and the derivatives of the log-likelihood by them."""
+        found = self.linearised(self.sim, self.path, sigma**2)
+        return found, sigma * (found.moved - found.expected)
+
 
 class OutputErrorPath(Bands, Printed):
     """The most probable path of a Hammerstein-Wiener system, with bands.
@@ -246,7 +268,7 @@ class OutputErrorPath(Bands, Printed):
     theta, std : (T, n)
         The minimal parameters (a, b, c_2 .., d_2 .., l) and free knots, and their standard deviations.
     cov : (T, n, n)
-        Their covariances, given r, q_w and q.
+        Their covariances, with those of r, q_w and q that are estimated at their means given y.
     names : tuple of str
     w, prediction : (T,)
         Output of the linear block, and the simulated output.
@@ -260,7 +282,7 @@ class OutputErrorPath(Bands, Printed):
 
     def __init__(self, run: Track, fit: Fit) -> None:
         self.run, self.system, self.names = run, fit.system, fit.system.names
-        self.theta, self.cov, self.loglik = fit.path.x, fit.found.cov, fit.found.loglik
+        self.theta, self.cov, self.loglik = fit.path.x, fit.spread().cov, fit.found.loglik
         self.std = np.sqrt(np.maximum(np.einsum("tii->ti", self.cov), 0.0))
         self.w, self.prediction = fit.sim.w, fit.sim.y
         (self.r, self.q_w), self.q = fit.variances[:2].tolist(), fit.variances[2:]
