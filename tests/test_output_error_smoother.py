@@ -115,13 +115,14 @@ def test_the_path_is_the_most_probable_and_its_likelihood_that_of_laplace(forwar
 
 
 def test_bands_cover_paths_of_its_own_model():
-    """Errors within a record are alike: the mean of 24 records is known to .024, and was .919."""
+    """Errors within a record are alike: the mean of 24 records is known to .024. It was .912, and with variances at
+    their modes .859."""
     covered = []
     for seed in range(24):
         s = record(400, seed, snr_db=25.0)
-        low, high = output_error(run_of(s), q=WALK**2).band()
+        low, high = output_error(run_of(s)).band()
         covered.append(np.mean((low < s.xi) & (s.xi < high)))
-    assert 0.88 < np.mean(covered) < 0.99
+    assert 0.89 < np.mean(covered) < 0.99
 
 
 def test_drift_and_noise_are_found():
@@ -216,10 +217,28 @@ def test_a_curve_without_inverse_and_its_knots():
         found.blocks(output="unit")
 
 
+def test_a_nearly_even_curve_is_found_from_its_bends():
+    """y = .1 w + w^2, of which the best line says nearly nothing."""
+    rng, T = np.random.default_rng(2), 800
+    u, w = rng.normal(size=T), np.zeros(T)
+    for t in range(2, T):
+        w[t] = 0.7 * w[t - 1] - 0.2 * w[t - 2] + 0.7 * u[t - 1] - 0.3 * u[t - 2]
+    y = 0.1 * w + w**2
+    y += 0.1 * y.std() * rng.normal(size=T)
+    run = track(HammersteinWiener(2, 2), Kalman(q=1e-6, r=1e-2, p0=1e2), y, u)
+    found = output_error(run, Polynomial(2))
+    np.testing.assert_allclose(found.theta[-1, :4], [-0.7, 0.2, 0.07, -0.03], atol=0.03)
+    line = [*np.median(run.theta[100:], axis=0), 0.0]
+    assert output_error(run, Polynomial(2), start=line).loglik < found.loglik - 50.0
+
+
 def test_what_it_refuses(noisy):
     s, run = noisy
     with pytest.raises(ValueError, match="HammersteinWiener"):
         output_error(track(ARX(1, 1), FLS(10.0), s.y, s.u))
+    two = track(HammersteinWiener(1, 1, ny=2), Kalman(q=1e-5, r=1e-3, p0=1e2), np.stack([s.y, s.y], axis=1), s.u)
+    with pytest.raises(ValueError, match="one output"):
+        output_error(two)
     with pytest.raises(ValueError, match="whole record"):
         output_error(track(s.model, run.tracker, s.y, s.u, warm_start=run))
     with pytest.raises(ValueError, match="knots"):

@@ -30,6 +30,7 @@ of a run; the prior of x_0 is as wide as its influence on y is small. Cost: some
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -340,11 +341,14 @@ def output_error(
     Raises
     ------
     ValueError
-        For another model, a run with a warm start or without samples, and knots where no curve has any.
+        For another model, several outputs (take one, run["level"]), a run with a warm start or without samples, and
+        knots where no curve has any.
     """
-    given = run.model
-    if not isinstance(given, HammersteinWiener) or run.start is not None:
-        raise ValueError("output_error: needs the run of a HammersteinWiener model over a whole record.")
+    whole_run = isinstance(run, Track) and run.start is None
+    if not whole_run or not isinstance(given := run.model, HammersteinWiener):
+        raise ValueError(
+            "output_error: needs the run of a HammersteinWiener model with one output, over a whole record."
+        )
     record, model = run.used_record, given if forward is None else replace(given, output=forward)
     used = np.isfinite(record.y)
     if not used.any():
@@ -364,7 +368,11 @@ def output_error(
     path = Path(
         np.tile(np.concatenate([xi, *system.free]), (len(run), 1)), np.zeros(len(run)), np.zeros(max(model.na, 1))
     )
-    paths = [path] if system.forward or q_w == 0.0 else [path, _following(system, record.y, path)]
+    paths = [path]
+    if system.forward and start is None:
+        paths += _bent(system, record.y[used].std(), path)
+    elif not system.forward and q_w != 0.0:
+        paths += [_following(system, record.y, path)]
     fits = [Fit(system, (record.y, noise, drift), one, fixed) for one in paths]
     best = max(fits, key=lambda fit: fit.found.loglik)
     best.estimate(whole("output_error", "rounds", rounds, 0))
@@ -382,6 +390,18 @@ def _median(run: Track, given: HammersteinWiener, system: System) -> Array:
         d = s.spans(False).d
         xi = np.concatenate([xi[: d[0]], np.zeros(len(d)), xi[d[0] + given.out.n - 1 :]])
     return np.asarray(xi)
+
+
+def _bent(system: System, height: float, path: Path) -> Iterator[Path]:
+    """Paths of a third of the gain, whose curve is mostly one of its functions, up or down, of the height of y."""
+    spans, x = system.model.structure.spans(False), path.x.copy()
+    x[:, np.concatenate(spans.b)] /= 3.0
+    g = system.model.out.value(system(path._replace(x=x)).w)[:, 1:]
+    for j, size in zip(spans.d, g.std(axis=0), strict=True):
+        for sign in (1.0, -1.0) if size > 0.0 else ():
+            bent = x.copy()
+            bent[:, j] = sign * height / size
+            yield path._replace(x=bent)
 
 
 def _following(system: System, y: Array, path: Path) -> Path:
