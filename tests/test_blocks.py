@@ -13,10 +13,9 @@ from support import same
 from driftfit import AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, minimal, split
+from driftfit.models.hammerstein_wiener.separation import METHODS, LeastSquares, split
 from driftfit.models.hammerstein_wiener.structure import Structure
-from driftfit.systems.hammerstein_wiener import CUBIC, START, simulate
-from driftfit.use.blocks import fit_constant
+from driftfit.systems.hammerstein_wiener import simulate
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 K = Kalman(q=1e-6, r=1e-4, p0=1e2, theta0=0.01)
@@ -48,7 +47,7 @@ def test_exact_products_come_apart_exactly(na, nb, n_in, n_out, seed):
         a, b, c, d, quality = split(model, theta, method)
         if method == "svd" and na == 0:
             assert same(d[:, 1:], theta[:, nb : nb + n_out - 1])
-        found = [minimal(model, Groups(*(part[t] for part in (a, b, c, d)))) for t in range(3)]
+        found = model.structure.minimal(a, b * c[:, :1], c / c[:, :1], d)
         assert_allclose(found, xi, rtol=1e-10, atol=1e-10)
         assert_allclose(np.linalg.norm(c, axis=1), 1.0, rtol=1e-14)
         assert (c @ model.rise >= 0.0).all()
@@ -261,28 +260,6 @@ def test_the_picture_has_its_panels():
         assert_allclose(other.get_xdata(), found.output_curve(other.get_ydata(), t))
     for axis, group in zip(figure.axes[2:], (found.a, found.b, found.c, found.d[:, 1:]), strict=True):
         assert same(np.stack([line.get_ydata() for line in axis.lines], axis=1), group)
-
-
-def test_instruments_and_the_unbiased_basis_take_the_bias_away():
-    """Section 8: at 20 dB least squares is off by 0.18, instruments and the unbiased basis by less than 0.01."""
-    off = []
-    for seed in range(3):
-        groups = (START[name] for name in "abcd")
-        s = simulate(CUBIC, *groups, T=20_000, rng=np.random.default_rng(seed), snr_db=20.0)
-        fits = (
-            fit_constant(CUBIC, s.y, s.u, rounds=0), fit_constant(CUBIC, s.y, s.u),
-            fit_constant(CUBIC, s.y, s.u, sigma=s.sigma),
-        )  # fmt: skip
-        off.append([np.linalg.norm(fit.xi - s.xi[0]) for fit in fits])
-    plain, instruments, both = np.median(off, axis=0)
-    assert plain == pytest.approx(0.18, rel=0.03)
-    assert 0.03 < instruments / plain < 0.05
-    assert both < 0.87 * instruments
-    assert np.std(fits[2].y - s.y0) < 0.2 * s.sigma
-    with pytest.raises(ValueError, match="raw powers"):
-        fit_constant(HammersteinWiener(1, 1, output=Legendre(3, (-3, 3))), s.y, s.u, sigma=0.1)
-    with pytest.raises(ValueError, match="cannot determine 14"):
-        fit_constant(CUBIC, s.y[:10], s.u[:10])
 
 
 def test_every_input_has_a_panel():

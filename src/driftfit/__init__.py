@@ -61,6 +61,7 @@ from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
 from driftfit.use.blocks import diagnose_blocks, free_run
+from driftfit.use.output_error import output_error
 from driftfit.use.system_from_path import rational_model, static_curve
 
 __all__ = [
@@ -126,6 +127,7 @@ __all__ = [
     "identify",
     "likelihood_ratio",
     "local_shrinkage",
+    "output_error",
     "piecewise",
     "plot_tree",
     "pool",

@@ -18,14 +18,15 @@ from driftfit.models.hammerstein_wiener.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.output_error import OutputError
-from driftfit.models.hammerstein_wiener.separation import Groups, minimal, split
 from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.results import Track
+from driftfit.smooth.problem import replay
 from driftfit.systems.arc_furnace import THRESHOLDS, A, B, Furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, WALK, Simulated, example
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
-from driftfit.use.blocks import fit_constant, free_run, regression
+from driftfit.use.blocks import free_run
+from driftfit.use.output_error import output_error
 
 PAPER = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
 FAST = ExtendedKalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
@@ -62,8 +63,7 @@ def one_step(run: Track, s: Simulated) -> Array:
 
     Those of the run itself are inverted on the range until then, and clipped to it.
     """
-    into, out = s.model.into.value(s.u), s.model.out.value(s.y)
-    phi, late = regression(s.model, into, out)[0][1:], run.theta[:-1]
+    phi, late = replay(run)["phi"][1:, :, 0], run.theta[:-1]
     at = s.model.structure.starts[0]
     right = -np.sum(np.delete(phi * late, range(at, at + s.model.out.n - 1), axis=1), axis=1)
     invert = Inverse(s.model, s.model.output_weights(late), (s.y.min(), s.y.max()))
@@ -213,25 +213,26 @@ def misfit(snr_db: float | None, equation_noise: float, seed: int, T: int = 5000
 
     rng = np.random.default_rng(seed)
     s = simulate(CUBIC, *(START[name] for name in "abcd"), T=T, rng=rng, snr_db=snr_db, equation_noise=equation_noise)
-    run = track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
-    groups = Groups(*(part[0] for part in split(CUBIC, run.theta[-1:], "svd-joint")[:4]))
-    return np.asarray(minimal(CUBIC, groups) - s.xi[-1])
+    return np.asarray(separated(constant(s), "svd-joint")[-1] - s.xi[-1])
 
 
-FIXES = ("least squares", "instruments", "instruments, unbiased basis")
+def constant(s: Simulated) -> Track:
+    """Least squares with constant parameters."""
+    return track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
+
+
+FIXES = ("least squares", "output_error")
 
 
 def fixes(seed: int, T: int = 20_000) -> dict[str, float]:
-    """|xi_hat - xi| on a constant system at 20 dB, by the method that removes the bias."""
+    """|xi_hat - xi| on a constant system at 20 dB, by least squares and by the method that removes the bias."""
     from driftfit.systems.hammerstein_wiener import START, simulate
 
     groups = (START[name] for name in "abcd")
     s = simulate(CUBIC, *groups, T=T, rng=np.random.default_rng(seed), snr_db=20.0)
-    fits = (
-        fit_constant(CUBIC, s.y, s.u, rounds=0), fit_constant(CUBIC, s.y, s.u),
-        fit_constant(CUBIC, s.y, s.u, sigma=s.sigma),
-    )  # fmt: skip
-    return {name: float(np.linalg.norm(fit.xi - s.xi[0])) for name, fit in zip(FIXES, fits, strict=True)}
+    run = constant(s)
+    fits = separated(run, "svd-joint")[-1], output_error(run, q=0.0, q_w=0.0).theta[-1]
+    return {name: float(np.linalg.norm(xi - s.xi[0])) for name, xi in zip(FIXES, fits, strict=True)}
 
 
 def choice(name: str, seed: int, T: int = 5000) -> float:

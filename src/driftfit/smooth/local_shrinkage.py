@@ -25,7 +25,7 @@ parameter each.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,14 +36,13 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.run.program import progress as bar
 from driftfit.run.result import Track
-from driftfit.show.text import Printed, table_of
+from driftfit.show.text import table_of
 from driftfit.smooth.changes import dated
 from driftfit.smooth.problem import walk_of
-from driftfit.smooth.smoothed import plot_smoothed
+from driftfit.smooth.smoothed import Bands
 from driftfit.smooth.solvers.walk import Walk, constants
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from rich.table import Table
 
 LEAST_MOVE = 1e-10
@@ -68,7 +67,7 @@ class Sampled(NamedTuple):
         return self._replace(theta=self.theta[:, of], jumps=np.where(new[:, None], self.jumps[:, of], 0.0))
 
 
-class Shrunk(Printed):
+class Shrunk(Bands):
     """Parameters whose moves are shrunk one by one; every number is made from draws of the posterior.
 
     Attributes
@@ -131,10 +130,6 @@ class Shrunk(Printed):
                 f"{low[j]:.2f} .. {high[j]:.2f}", ", ".join(dates[name]) or "-",
             )  # fmt: skip
         return shown
-
-    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
-        """Parameters with bands over the filtered path; a matplotlib figure. ``ax`` as for `Track.plot`."""
-        return plot_smoothed(self.run, self.theta, *self.band(level), ax)
 
 
 def local_shrinkage(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import cached_property
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.blocks import Blocks
+from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track
 from driftfit.show.axes import BLUE, GREY, panels
 from driftfit.show.text import Printed, path_table
@@ -55,7 +55,43 @@ class Fit(NamedTuple):
     c: Array
 
 
-class Smoothed(Printed):
+class Bands(Printed):
+    """A path ``theta`` of parameters with ``names`` and ``std``, from the record of a run."""
+
+    run: Track
+    theta: Array
+    std: Any
+    names: Any
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
+        half = quantile(level) * self.std
+        return self.theta - half, self.theta + half
+
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, over those of the run if they are the same; a matplotlib figure. ``ax`` as for
+        `Track.plot`.
+        """
+        run, n, (low, high) = self.run, len(self.names), self.band(level)
+        columns = 1 if n <= 4 else 2 if n <= 12 else 4
+        rows = -(-n // columns)
+        figure, axes = panels(ax, (9.0, 1.7 * rows + 0.8), n, columns, sharex=True)
+        for i, axis in enumerate(axes):
+            known = np.isfinite(low[:, i]) & np.isfinite(high[:, i])
+            axis.fill_between(run.time, low[:, i], high[:, i], where=known, color=BLUE, alpha=0.2, lw=0)
+            axis.plot(run.time, self.theta[:, i], color=BLUE, lw=1.4, label="smoothed")
+            if self.names == run.names:
+                view = axis.get_ylim()
+                axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
+                axis.set_ylim(*view)
+            axis.set_ylabel(self.names[i])
+            axis.grid(alpha=0.25, lw=0.5)
+        axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
+        axes[-1].set_xlabel("time" if run.timed else "sample")
+        return figure
+
+
+class Smoothed(Bands):
     """Parameters of a record, each estimated from the complete record.
 
     Attributes
@@ -251,13 +287,6 @@ class Smoothed(Printed):
     def dynamic_cost(self) -> float:
         return self.cost - self.measurement_cost
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
-        return self.theta - half, self.theta + half
-
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta at sample t; entries of undetermined parameters are inf on the diagonal."""
         cov: Array = self.r * self._covariances.cov[t]
@@ -285,10 +314,6 @@ class Smoothed(Printed):
     def _covariances(self) -> Path:
         """The path with its covariances; the problem is solved again unless they were kept."""
         return self._path if len(self._path.cov) else self._of_instants(solve(self.walk, "cov", self.order_by))
-
-    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
-        """Parameters with bands, smoothed and filtered; a matplotlib figure. ``ax`` as for `Track.plot`."""
-        return plot_smoothed(self.run, self.theta, *self.band(level), ax)
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None, rebuild: Callable[[], Walk] | None = None) -> Path:
@@ -320,23 +345,3 @@ def noise_variance(data: Data, path: Path) -> float:
         )
         return float("nan")
     return path.cost / free
-
-
-def plot_smoothed(run: Track, theta: Array, low: Array, high: Array, ax: Any = None) -> Figure:
-    """Parameters with bands, smoothed over filtered."""
-    n = len(run.names)
-    columns = 1 if n <= 4 else 2 if n <= 12 else 4
-    rows = -(-n // columns)
-    figure, axes = panels(ax, (9.0, 1.7 * rows + 0.8), n, columns, sharex=True)
-    for i, axis in enumerate(axes):
-        known = np.isfinite(low[:, i]) & np.isfinite(high[:, i])
-        axis.fill_between(run.time, low[:, i], high[:, i], where=known, color=BLUE, alpha=0.2, lw=0)
-        axis.plot(run.time, theta[:, i], color=BLUE, lw=1.4, label="smoothed")
-        view = axis.get_ylim()
-        axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
-        axis.set_ylim(*view)
-        axis.set_ylabel(run.names[i])
-        axis.grid(alpha=0.25, lw=0.5)
-    axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
-    axes[-1].set_xlabel("time" if run.timed else "sample")
-    return figure

@@ -68,6 +68,13 @@ the last table of `benchmarks/bank_prior.py` are 1.28, 1.40 and 1.96; where noth
 
 
 @shared
+def increments_now(t: Any) -> None:
+    """Covariances of the changes in this interval; where it is one level, a change happens in one nominal sample."""
+    time, dt = t.time, t.dt
+    increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
+
+
+@shared
 def count(t: Any) -> None:
     """Count the changes of the oldest level, given all samples since:
 
@@ -114,8 +121,7 @@ def prepare(t: Any) -> None:
     parted = len(t.path) > 0 and t.levels > 0 and (t.open + t.taken > 0 or t.expanded == 0)
     parted = parted and (t.open > 0 or not used or further(dt) > 0)
     t.alike, t.wide, t.parted = 1 if alike else 0, 1 if wide else 0, 1 if parted else 0
-    # where the interval is one level, a change happens in one nominal sample
-    increments(t, t.time, t.time / dt if t.apart > 0 and dt > 0.0 else t.time)
+    increments_now(t)
     if parted:
         go_on(t, dt, used)
     if wide:

@@ -24,7 +24,6 @@ components, and that for each likely drift.
 from __future__ import annotations
 
 from functools import cached_property
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -35,9 +34,11 @@ from driftfit.bank.results.events import Event
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
+from driftfit.show.text import path_table
 from driftfit.smooth import mixture
 from driftfit.smooth.mixture import Alternatives, Problem
 from driftfit.smooth.problem import replay
+from driftfit.smooth.smoothed import Bands
 from driftfit.smooth.solvers.components import Noises
 from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
 from driftfit.trackers.forms.information import triangular_root
@@ -54,7 +55,7 @@ NOISES = ((1.0, 0.95), (16.0, 0.04), (100.0, 0.01))
 """Factors of the noise variance for `Bank()`, and their probabilities before the record is seen."""
 
 
-class SmoothedMixture:
+class SmoothedMixture(Bands):
     """Parameters of a record, each estimated from the whole record under all hypotheses.
 
     Attributes
@@ -98,10 +99,10 @@ class SmoothedMixture:
         first = mixture.smooth(self._weighed[0][1], covariances, kept)
         return [first, *(mixture.smooth(one, covariances, first.kept) for _, one in self._weighed[1:])]
 
-    def __repr__(self) -> str:
-        lost = int(self.uneven.sum())
-        text = f"; hypotheses of some weight were neglected at {lost} samples" if lost else ""
-        return f"Smoothed path of {len(self.theta)} samples over all hypotheses of {self.run.tracker!r}{text}"
+    def __rich_console__(self, console: Any, options: Any) -> Any:
+        yield path_table("Smoothed over all hypotheses", self.names, self.theta, self.std)
+        if lost := int(self.uneven.sum()):
+            yield f" Hypotheses of some weight were neglected at {lost} samples."
 
     @cached_property
     def std(self) -> Array:
@@ -111,11 +112,6 @@ class SmoothedMixture:
     def covs(self) -> Array:
         """(T, n, n); computed again, with n n numbers for each sample."""
         return mixture.average(self._weights, self._smoothed(self.mixture.kept, covariances=True)).cov
-
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, n)."""
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
-        return self.theta - half, self.theta + half
 
 
 def hypotheses_of(bank: Bank, problem: Problem) -> list[tuple[float, Problem]]:

@@ -25,7 +25,7 @@ paper swaps left and right vectors and gives no gauge. Cost per sample: O(nb n_i
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -147,16 +147,6 @@ def _rising(rise: Array, left: Array, right: Array) -> tuple[Array, Array]:
         return _headed(left, right)
     scale = np.sqrt(np.sum(right * right, axis=1)) * np.where(np.sum(rise * right, axis=1) >= 0.0, 1.0, -1.0)
     return left * scale[:, None], right / scale[:, None]
-
-
-def minimal(model: HammersteinWiener, groups: Groups, intercept: Any = None) -> Array:
-    """xi (n_x,) from a, b, c, d of one sample in any gauge with d_1 = 1; not finite where c_1 = 0."""
-    structure = model.structure
-    pairs = zip(structure.of_inputs(groups.b, structure.nb), structure.of_inputs(groups.c, structure.n_in), strict=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = [(b * c[0], c / c[0]) for b, c in pairs]
-    b, c = (np.concatenate(part) for part in zip(*scaled, strict=True))
-    return structure.minimal(groups.a, b, c, groups.d, intercept)
 
 
 class LeastSquares:
