@@ -56,12 +56,10 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.models.base import Model
+from driftfit.models.polynomials.instruments import FOLLOWING
 from driftfit.trackers.forms.covariance import LEFT, prediction, product_with, symmetric_product
 from driftfit.trackers.forms.diffuse import MACHINES, forecast_on_roots, spanned_variance
 from driftfit.trackers.rls import Forgetting, correct_root_form, fade, forget_root_form, learn_settling_scale
-
-FOLLOWING = 0.05
-"""Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
 
 LEAST_SQUARES = 10.0
 """Samples for each parameter, at the start, that are used as in least squares."""

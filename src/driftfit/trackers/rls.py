@@ -59,11 +59,10 @@ from driftfit.trackers.forms.diffuse import (
     started,
     wander,
 )
+from driftfit.trackers.forms.excitation import LARGE
 
 RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
-LARGE = 25.0
-"""For the unit of P, a square above this multiple of the variance counts as this multiple."""
 
 
 def no_settling() -> dict[str, Any]:

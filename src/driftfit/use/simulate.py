@@ -39,6 +39,7 @@ from driftfit.models.polynomial import PolynomialModel
 from driftfit.run.live.conformal import quantile
 from driftfit.run.result import Track
 from driftfit.show.text import path_table, printing
+from driftfit.use.forecast import DRAWS
 from driftfit.use.system import covariances, filtered, spread, taken
 
 
@@ -297,7 +298,6 @@ def unbroken(run: Track, na: int, k: int) -> Array:
 
 Span = tuple[Any, Any]
 
-DRAWS = 200
 AT_ONCE = 8192
 """Number of rows that are run in parallel: their memory stays below a hundred megabytes."""
 

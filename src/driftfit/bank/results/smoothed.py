@@ -40,15 +40,11 @@ from driftfit.smooth.mixture import Alternatives, Problem
 from driftfit.smooth.problem import replay
 from driftfit.smooth.smoothed import Bands
 from driftfit.smooth.solvers.components import Noises
-from driftfit.smooth.unknown_drift import Point, drifting, neighbours, summit
+from driftfit.smooth.unknown_drift import FEW, LIKELY_SCALE, Point, drifting, neighbours, summit
 from driftfit.trackers.forms.information import triangular_root
 
 FACTORS = np.append(0.0, 10.0 ** np.arange(8.0))
 """Factors of the drift that are tried."""
-LIKELY = 0.1
-"""Drifts that are less likely than this share of the best are left out."""
-FEW = 8
-"""Components with which an evidence is computed."""
 RARITY = 20.0
 """Samples that the prior share of spikes counts for."""
 NOISES = ((1.0, 0.95), (16.0, 0.04), (100.0, 0.01))
@@ -291,7 +287,7 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[t
     common = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
     best = summit(value, common, lambda at: neighbours(at, [[i] for i in range(n)], top))
     shares = {levels: np.exp(logs - known[best][0]) for levels, (logs, _) in known.items()}
-    likely = sorted((one for one in shares if shares[one] > LIKELY), key=lambda one: -shares[one])
+    likely = sorted((one for one in shares if shares[one] > LIKELY_SCALE), key=lambda one: -shares[one])
     total = sum(shares[one] for one in likely)
     return [(shares[one] / total, scaled(at(one), known[one][1])) for one in likely]
 

@@ -37,6 +37,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, SMALLEST
 from driftfit.engine.kernel import Array, kernel, part
+from driftfit.models.base import GAP
 
 LEVELS, BLOCKS, SHORT = 6, 12, 8
 """Levels of blocks of 1, 2, 4, .. samples; blocks that each keeps; blocks of the shorter window."""
@@ -44,8 +45,6 @@ LENGTHS = tuple(blocks << level for level in range(LEVELS) for blocks in (SHORT,
 """Samples L of the windows: 8, 12, 16, 24, .., 384."""
 SHORTER = tuple(float(np.log(LENGTHS[-1] / L)) for L in LENGTHS)
 """log(longest / L) of the windows."""
-GAP = 1.5
-"""In an interval longer than this, samples of the autoregression are missing."""
 LONG_GAP = 100.0
 """At most so many are predicted: later ones hardly differ."""
 ROOT = 0.999
