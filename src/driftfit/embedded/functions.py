@@ -89,13 +89,11 @@ class Statements(Expressions):
     def on_pass(self, node: ast.Pass) -> None:
         """Nothing."""
 
-    def on_break(self, node: ast.Break) -> bool:
-        self.line("break;")
+    def on_break(self, node: ast.Break | ast.Continue) -> bool:
+        self.line(f"{ast.unparse(node)};")
         return True
 
-    def on_continue(self, node: ast.Continue) -> bool:
-        self.line("continue;")
-        return True
+    on_continue = on_break
 
     def on_annassign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
@@ -188,7 +186,7 @@ class Statements(Expressions):
             return
         name = identifier(node.target.id)
         high, low = (stop, start) if step > 0 else (start, stop)
-        top = self.largest(high)
+        top = high.most if high.most is not None else self.unit.largest  # the largest extent, if it is not known
         turns = max(0, top - (low.constant if low.known else 0))
         turns = -(-turns // abs(step))
         sign = "<" if step > 0 else ">"
@@ -201,10 +199,6 @@ class Statements(Expressions):
         self.forget(node)
         self.line("}")
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
-
-    def largest(self, value: Value) -> int:
-        """Upper bound of a loop, or the largest extent of the record if it is not known."""
-        return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
         self.forget(node)
@@ -456,7 +450,8 @@ def translation(program: Program, fixed_rate: bool = False, horizon: int | None 
     u = Value("array", "u", shape=(program.model.m,), strides=(1,))
     factors = () if fixed_rate else FACTORS
     constant = frozenset(fields(tile)) - {*factors, *RESULTS, *program.tracker.settings()}
-    flags = frozenset(name for name in constant if _may_be_flag(tile[name][0]))
+    single = {name: tile[name].item() for name in constant if tile[name].size == 1 and tile[name].dtype.kind == "f"}
+    flags = frozenset(name for name, start in single.items() if start in (0.0, 1.0) and not np.signbit(start))
     scratch = frozenset(program.scratch) & {*fields(tile)}
     while True:
         unit, ordinary = (Unit(tile, constant, flags, scratch, ordinary) for ordinary in (False, True))
@@ -478,8 +473,10 @@ def _planning(program: Program, unit: Unit, h: int) -> Planning:
     given: dict[str, tuple[int, ...]] = {"target": (h,), "given": (h, m), "low": (m,), "high": (m,), "move": (m,)}
     own = room(model, program.tracker, h)
     shapes = {**given, "effort": (), "caution": (), "probe": (), **own, "P": (model.n, model.n)}
-    p = {name: _field_of_plan(name, shape) for name, shape in shapes.items()}
-    lags = [_lags(unit, name) for name in ("y_lag", "u_lag")]
+    p = {name: Value("array" if shape else "real", f"p->{name}", shape=shape, strides=strides_of(shape))
+         for name, shape in shapes.items()}  # fmt: skip
+    fields_of_lags = [unit.field(name) for name in ("y_lag", "u_lag")]  # (rows, lags) of the state
+    lags = [view(one, [*(range(size) for size in one.shape[:2]), number(0)]) for one in fields_of_lags]
     known = [Value("table", constant=terms_of(model)), *lags, number(0)]
     looking = [Value("record"), p["P"], p["caution"], Value("int", "k"), p["points"]]
     planned = [*known, *(p[name] for name in (*given, "effort", "probe", *own))]
@@ -489,20 +486,3 @@ def _planning(program: Program, unit: Unit, h: int) -> Planning:
         calls.append(f"{made.name}({', '.join(text for one in arguments if (text := _passed(one)))})")
         operations.append(made.operations)
     return Planning(shapes, calls[0], calls[1], (operations[0], operations[1]))
-
-
-def _field_of_plan(name: str, shape: tuple[int, ...]) -> Value:
-    if not shape:
-        return Value("real", f"p->{name}")
-    return view(Value("array", f"p->{name}", shape=shape, strides=strides_of(shape)), [range(size) for size in shape])
-
-
-def _lags(unit: Unit, name: str) -> Value:
-    """The lags (rows, lags) of the state."""
-    field = unit.field(name)
-    return view(field, [*(range(size) for size in field.shape[:2]), number(0)])
-
-
-def _may_be_flag(start: Array) -> bool:
-    """Whether a field is one floating-point number that starts as 0 or 1."""
-    return start.size == 1 and start.dtype.kind == "f" and start.item() in (0.0, 1.0) and not np.signbit(start.item())

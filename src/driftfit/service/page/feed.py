@@ -292,9 +292,6 @@ def _as_lists(found: list[tuple[Array, int]]) -> dict[str, Any]:
     return {"count": sum(count for _, count in found), **columns}
 
 
-METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
-
 def metrics_of(feed: Feed, viewers: int) -> str:
     """Numbers for Prometheus, in its text format."""
     status, trouble = feed.status, feed.trouble.items()
