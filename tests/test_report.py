@@ -122,11 +122,6 @@ def test_names_from_a_table_are_escaped():
     assert "a<b" not in text
 
 
-def test_wrong_ending(run, tmp_path):
-    with pytest.raises(ValueError, match=r"\.html"):
-        run.report(tmp_path / "page.pdf")
-
-
 def test_command_line_writes_a_page(tmp_path):
     y, u = arx_record(300, 2)
     pl.DataFrame({"y": y, "u": u, "unit": np.repeat(["a", "b"], 150)}).write_csv(tmp_path / "r.csv")

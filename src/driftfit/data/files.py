@@ -110,12 +110,9 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
         _check_widths(content, sign, len(raw))
         every = pl.read_csv(content, columns=read, truncate_ragged_lines=True, **options)
     units = _units(list(csv.reader(lines, delimiter=sign))[1:], names, wanted)
-    frame = every.slice(bool(units)).select(list(chosen)).rename(chosen)
-    if wanted.decimal == ",":
-        words = (*HISTORIANS, *wanted.missing)
-        frame = frame.with_columns(
-            points(present(frame[name], words)) for name in wanted.signals if name in frame.columns
-        )
+    frame, words = every.slice(bool(units)).select(list(chosen)).rename(chosen), (*HISTORIANS, *wanted.missing)
+    signals = [name for name in wanted.signals if name in frame.columns and wanted.decimal == ","]
+    frame = frame.with_columns(points(present(frame[name], words)) for name in signals)
     keys = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 
@@ -351,7 +348,7 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
             raise ValueError(f"{where} cannot be read as CSV: {' '.join(str(error).split())}") from None
     if not wanted.names:
         return read_file(source, replace(wanted, numbers=tuple(names)), where)
-    for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
+    for name in (name for name in wanted.names if name != FILE or FILE not in wanted.by):
         if name not in names:
             raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")
         if names.count(name) > 1:

@@ -270,12 +270,9 @@ class Body(Statements):
             if one.kind in ("record", "tile"):
                 self.parameters += ["tracker_state *s", "scratch_fields *scratch"]
                 named[argument.arg] = one
-            elif one.kind == "array":
-                constant = "const " if one.text == "u" else ""
+            elif one.kind in ("array", "address"):  # an address is one of real numbers
+                constant = "const " if one.kind == "array" and one.text == "u" else ""
                 self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
-                named[argument.arg] = renamed(one, name)
-            elif one.kind == "address":
-                self.parameters.append(f"real *{name}")
                 named[argument.arg] = renamed(one, name)
             elif one.kind == "items":
                 own = [renamed(item, f"{name}{k}") for k, item in enumerate(one.constant)]

@@ -31,6 +31,7 @@ import polars as pl
 
 from driftfit.data.files import without_formulas
 from driftfit.data.instants import in_zone
+from driftfit.data.storage import replace_file
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet, KeyedResults, Outputs, table_by_key
@@ -101,9 +102,8 @@ def write_parts(fleets: Iterator[Fleet], to: str | PathLike[str]) -> Written:
         failed |= fleet.failed
         if not len(fleet):
             continue
-        table, file = as_table(fleet), folder / f"part-{k:06d}.parquet"
-        table.write_parquet(file.with_suffix(".partial"))
-        file.with_suffix(".partial").rename(file)
+        table = as_table(fleet)
+        replace_file(folder / f"part-{k:06d}.parquet", table.write_parquet)
         series, rows = series + len(fleet.series()), rows + len(table)
     return Written(folder, series, rows, failed)
 

@@ -211,17 +211,10 @@ class Engine:
                 self.tell("", "source", {"source": source, "noticed": batch.noticed})
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = (
-            (batch.client or source, samples, batch.receipt)
-            for source, batch in arrived.batches
-            for samples in batch.samples
-        )
-        items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
-        for action in arrived.actions:
-            unit = self.units.names.get(action.unit)
-            if unit is not None:
-                items.append(Act(unit, action.what))
-        return items
+        messages = ((one.client or source, samples, one.receipt) for source, one in arrived.batches
+                    for samples in one.samples)  # fmt: skip
+        admitted, names = self.units.admitted(messages, self._pending, self.next), self.units.names
+        return [*admitted, *(Act(names[one.unit], one.what) for one in arrived.actions if one.unit in names)]
 
     def _process(self, first: int, items: list[Item], now: float) -> dict[int, str]:
         """Update the units of a group; its results become part of the next transaction.
@@ -325,14 +318,13 @@ class Engine:
         while True:
             try:
                 self._pending.commit(self.journal.db)
+                break
             except sqlite3.Error as error:
                 if not self.problem:
                     log.error("journal", extra={"detail": str(error)})
                 self.problem = f"the journal cannot be written: {error}; sources are held back."
                 if self._stop.wait(RETRY_SECONDS):
                     return False
-                continue
-            break
         self.problem = ""
         self.positions |= self._pending.positions
         self.last_stored = max([self.last_stored, *(first for first, *_ in self._pending.results)])

@@ -155,8 +155,12 @@ class Section:
             return
         refused = self._refused_before(own)
         self.streams.words[own], self.streams.begun[own] = found.states(), True
-        if self.streams.program.gate is not None:
-            self._count_refused(found, places, own, self._refused_before(own) - refused)
+        if self.streams.program.gate is not None:  # what gates left out, of the samples and of the first ones of units
+            reason, first_refused = found.reasons(), self._refused_before(own) - refused
+            for k in np.flatnonzero((reason != gate.USED) & (reason % gate.SIGNAL != gate.AT_START)).tolist():
+                self._count(places[k], reason.item(k), 1)
+            for k in np.flatnonzero(first_refused > 0).tolist():
+                self._count(own[k], gate.AT_START, first_refused.item(k))
         if time is not None:
             self.streams.last[own] = time[first + length - 1]
         self._tell(found, Rows(self.streams.index, places, time, values), known[:, NOISE], number, out)
@@ -167,14 +171,6 @@ class Section:
             return np.zeros(len(own), int)
         words = self.streams.program.layout.field(self.streams.words[own], "gate_refused")[:, 0]
         return np.where(self.streams.begun[own], words, 0)
-
-    def _count_refused(self, found: Advanced, places: Array, own: Array, first: Array) -> None:
-        """Count what gates left out, by reason: samples at ``places`` (N,), and ``first`` samples of units (K,)."""
-        reason = found.reasons()
-        for k in np.flatnonzero((reason != gate.USED) & (reason % gate.SIGNAL != gate.AT_START)).tolist():
-            self._count(places[k], reason.item(k), 1)
-        for k in np.flatnonzero(first > 0).tolist():
-            self._count(own[k], gate.AT_START, first.item(k))
 
     def _count(self, place: int, code: int, count: int) -> None:
         tally((self.units[place].rare, self.left_out), SAID[code % gate.SIGNAL][0].lower(), count)

@@ -361,8 +361,7 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
         return {"do": "calibrated", "rules": [], "refused": dict.fromkeys(alarm.on, str(error))}
     for kind in alarm.on:
         try:
-            alarms = run.detect(kind, every=alarm.each, reference=len(rows))
-            rules.append(describe(alarms.rule))
+            rules.append(describe(run.detect(kind, every=alarm.each, reference=len(rows)).rule))
         except Exception as error:
             refused[kind] = str(error)
     return {"do": "calibrated", "rules": rules, "on": list(alarm.on), "refused": refused, "samples": len(rows)}

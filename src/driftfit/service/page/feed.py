@@ -100,10 +100,8 @@ class Feed:
             for unit in self.journal.evicted() & self.latest.keys():
                 del self.latest[unit], self.updated[unit]
                 self._base.pop(unit, None)
-        for unit in [
-            unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > WATCHED_SECONDS
-        ]:
-            del self.watched[unit]
+        since = time.monotonic() - WATCHED_SECONDS
+        self.watched = {unit: one for unit, one in self.watched.items() if one[1][0] >= since}
 
     def drift(self, unit: int, row: Result) -> float:
         """The largest change of a parameter in the last minutes, in standard deviations."""
