@@ -19,6 +19,7 @@ from driftfit import ARX, Kalman, track
 from driftfit.service.config import parse
 from driftfit.service.connect.base import Batch, decode
 from driftfit.service.core.engine import Engine
+from driftfit.service.core.journal import Rows
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-4, r=0.1)
 UNIT = """
@@ -50,6 +51,13 @@ def run_of(y, u, time=None, **more):
     return track(
         MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, gate=True, **more
     )
+
+
+def rows_of(engine, unit):
+    """(times, values) of a unit, by its number, that the log has, in the order of their arrival."""
+    rows = [item for _, items in engine.journal.groups(1) for item in items if isinstance(item, Rows)]
+    own = [item.some(item.unit == unit) for item in rows]
+    return [t for one in own for t in one.time.tolist()], [row for one in own for row in one.values.tolist()]
 
 
 def coded():

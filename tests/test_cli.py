@@ -91,12 +91,6 @@ def test_dates_need_dt_and_take_it(tmp_path):
     assert np.array_equal(table["theta_a1"], track(ARX(1, 1), Kalman(q=1e-4, r=0.01), y, u).theta[:, 0])
 
 
-def test_regressors_are_named_after_columns(file):
-    arguments = ["--y", "flow rate", "--u", "pressure", "--model", "regression:intercept"]
-    printed = run("track", file, *arguments, *SETTINGS)
-    assert "Regression(regressors=('pressure',), intercept=True)" in printed
-
-
 def test_a_folder_that_is_not_there_is_named_before_the_work(file, tmp_path):
     arguments = ["track", file, "--y", "flow rate", "--u", "pressure", *SETTINGS]
     for option, name in (("--out", "x.csv"), ("--plot", "x.png"), ("--report", "x.html")):

@@ -161,18 +161,6 @@ def test_detect_scores_labels_and_writes_alarms(table):
     assert "--labels: labels are 0 or 1" in fails("detect", *DATED, *options[:-1], "flow")
 
 
-@pytest.mark.parametrize(("kind", "name"), [("glr", "a.csv"), ("glr", "a.parquet")])
-def test_alarms_of_other_kinds_are_written_too(table, kind, name):
-    run(
-        "detect", *DATED, "--kind", kind, "--reference", "150", "--every", "100", "--out", name, "--report", "page.html"
-    )
-    written = pl.read_csv(name) if name.endswith("csv") else pl.read_parquet(name)
-    alarms = expected().detect(kind, reference=150, every=100).table
-    assert written["cause"].to_list() == alarms["cause"].to_list() != []
-    assert np.allclose(written["statistic"], alarms["statistic"])
-    assert alarms["from"][0] in Path("page.html").read_text()
-
-
 def test_tune_smooth_and_forecast(table):
     kalman = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", "--tracker", "kalman"]
     printed = run("tune", *kalman, "-p", "r=0.01")

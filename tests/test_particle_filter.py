@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from driftfit import JointKalman, Live, ParticleFilter, StateSpace, track
-from driftfit.trackers.state_space.draws import normal
+from driftfit.trackers.state_space.particle_steps import normal
 
 BENDING = StateSpace(
     """

@@ -29,6 +29,7 @@ from service_support import (
     receiver,
     record,
     results_of,
+    rows_of,
     running,
     serving,
     settled,
@@ -110,7 +111,7 @@ def test_a_file_that_is_cut_and_written_again_is_read_from_its_start(tmp_path, s
         runner = SourceThread(engine, source)
         with running(engine, runner):
             until(lambda: runner.count == 1500)
-    assert engine.journal.rows_of(1)[0] == list(range(2500))
+    assert rows_of(engine, 1)[0] == list(range(2500))
     (found,) = events(engine, "source")
     assert "does not continue at byte" in found["noticed"]
 
@@ -291,7 +292,7 @@ def test_new_units_are_limited_by_client_and_those_that_had_few_samples_are_forg
     feed(engine, message("plant/slow", range(3, 40), y[3:], u[3:]))
     feed(engine, message("plant/Ann0", [1.0], y[:1], u[:1]))
     assert np.array_equal(engine.units.get(engine.units.names["slow"]).live.theta, theta_of(y, u))
-    rows = engine.journal.rows_of(engine.units.names["slow"])[0]
+    rows = rows_of(engine, engine.units.names["slow"])[0]
     assert rows == list(range(40))
     assert len(engine.units) == 18
     assert len({row[0] for row in results_of(engine)}) == engine.next - 1

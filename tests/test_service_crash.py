@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import MODEL, TRACKER, UNIT, configured, opened, record
+from service_support import MODEL, TRACKER, UNIT, configured, opened, record, rows_of
 
 from driftfit import track
 
@@ -80,7 +80,7 @@ def check(config, home, data):
     parquet = pl.concat(pl.read_parquet(file) for file in (home / "out").glob("*.parquet"))
     for k, (y, u) in enumerate(data):
         run = track(MODEL, TRACKER, y, u, time=np.arange(T) * 1.0, dt=1.0)
-        times, journal = engine.journal.rows_of(engine.units.names[f"p{k}"])
+        times, journal = rows_of(engine, engine.units.names[f"p{k}"])
         assert times == run.time.tolist()  # none lost, none doubled, in order
         assert np.array_equal(journal, np.column_stack([y, u]))
         assert np.array_equal(engine.units.get(engine.units.names[f"p{k}"]).live.theta, run.theta[-1])

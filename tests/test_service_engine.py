@@ -23,6 +23,7 @@ from service_support import (
     opened,
     record,
     results_of,
+    rows_of,
     run_of,
     settled,
     stored,
@@ -91,7 +92,7 @@ def test_late_rows_are_put_in_order(tmp_path):
     state, streams = unit.state(), unit.streams
     run = run_of(y[:195], u[:195])
     assert np.array_equal(unit.live.theta, run.theta[-1])
-    times, rows = engine.journal.rows_of(1)
+    times, rows = rows_of(engine, 1)
     assert sorted(times) == list(range(200))
     assert len(rows) == 200
     again = Section(0, unit.settings).add(1, "a")
@@ -276,7 +277,7 @@ def test_a_torn_write_leaves_a_whole_journal(tmp_path):
         cut = int(rng.integers(len(wal) // 4, len(wal)))
         (torn / "driftfit.db-wal").write_bytes(wal[:cut] + rng.bytes(3000 * (attempt % 2)))
         again = opened(config, torn)
-        times, _ = again.journal.rows_of(1)
+        times, _ = rows_of(again, 1)
         assert times == list(range(len(times)))
         if times:
             assert np.array_equal(again.units.get(1).live.theta, run.theta[len(times) - 1])
@@ -415,7 +416,7 @@ def test_many_units_with_few_rows_are_those_of_track(tmp_path):
         engine.step(0.0)
     for j in range(12):
         unit = engine.units.get(engine.units.names[f"{j}:y"])
-        times, rows = engine.journal.rows_of(unit.number)
+        times, rows = rows_of(engine, unit.number)
         if j % 2 == 0:
             run = run_of(*np.array(rows)[np.argsort(times)][:-3].T, limits={"u": (-2, 2)})
             assert unit.waiting == 3

@@ -21,6 +21,7 @@ from service_support import (
     opened,
     record,
     results_of,
+    rows_of,
     run_of,
     settled,
 )
@@ -231,13 +232,13 @@ def test_old_journals_become_parquet(tmp_path, monkeypatch):
         feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
     engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
     engine.step(0.0)
-    assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
+    assert export(tmp_path, engine.journal.number("needed from"), time.time() + 1) == 0  # the states are not stored
     engine._store_states(everything=True)
     engine._commit()
     monkeypatch.setattr("driftfit.service.core.archive.SEARCH_SECONDS", -1.0)
     for _ in range(100):
         engine.step(0.0)
-        if not engine.journal.rows_of(1)[0]:
+        if not rows_of(engine, 1)[0]:
             break
         time.sleep(0.05)
     table = pl.concat(pl.read_parquet(file) for file in sorted((tmp_path / "journal").glob("*.parquet")))

@@ -28,6 +28,7 @@ from service_support import (
     metric,
     opened,
     record,
+    rows_of,
     running,
     until,
 )  # fmt: skip
@@ -374,7 +375,7 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
         assert answer["received"] == 2
         assert "plant/b" in answer["refused"][0]
         assert "status" not in answer
-        assert len(engine.journal.rows_of(1)[0]) == 2
+        assert len(rows_of(engine, 1)[0]) == 2
         for topic, sent, status, reason in (
             ("plant/a", b"{", 400, "not an object"),
             ("", b"[1, 2]", 400, "not an object"),
@@ -396,7 +397,7 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
         assert answer["missing"]["plant/a"]["y"] == {"count": 3, "first": [1, 2, 3]}  # a number as text is one
         assert answer["missing"]["plant/a"]["u"]["count"] == 4
         assert "status" not in INCOMING.offer("plant/a", b'{"t": 3, "y": 1}')  # sent again, as after a lost answer
-        assert len(engine.journal.rows_of(1)[0]) == 7
+        assert len(rows_of(engine, 1)[0]) == 7
     names = Names(engine.journal)
     names.read()
     assert names.about["a"]["names"] == ["a1", "b1[u]"]

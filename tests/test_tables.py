@@ -40,15 +40,7 @@ def assert_same(one: Track, other: Track) -> None:
         assert np.array_equal(one.written(name), other.written(name), equal_nan=True), name
 
 
-def as_pandas(columns):
-    return pd.DataFrame(columns)
-
-
-def as_pyarrow(columns):
-    return pa.table(columns)
-
-
-KINDS = {"pandas": as_pandas, "polars": pl.DataFrame, "pyarrow": as_pyarrow, "lazy": pl.LazyFrame}
+KINDS = {"pandas": pd.DataFrame, "polars": pl.DataFrame, "pyarrow": pa.table, "lazy": pl.LazyFrame}
 
 
 @pytest.mark.parametrize("kind", KINDS)

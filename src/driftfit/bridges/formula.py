@@ -276,8 +276,8 @@ class TimeVaryingResults:
         if alpha not in factors:
             raise ValueError(f"cusum_limits: alpha={alpha} has no tabulated factor; choose from {sorted(factors)}.")
         there = self.recursive_residuals.notna()
-        count = max(int(there.sum()), 1)
-        limit = factors[alpha] * (np.sqrt(count) + 2 * np.cumsum(there) / np.sqrt(count))
+        root = np.sqrt(max(int(there.sum()), 1))
+        limit = factors[alpha] * (root + 2 * np.cumsum(there) / root)
         return pd.DataFrame({"lower": -limit, "upper": limit}, self.endog.index)
 
     def plot_cusum(self, alpha: float = 0.05, ax: Any = None) -> Figure:

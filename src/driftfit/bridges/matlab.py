@@ -307,9 +307,7 @@ def _struct(one: Experiment) -> dict[str, Any]:
 
 def _cell(texts: Sequence[str]) -> Array:
     """A cell array of texts, (k, 1)."""
-    cell = np.empty((len(texts), 1), dtype=object)
-    cell[:, 0] = texts
-    return cell
+    return np.array(texts, dtype=object).reshape(-1, 1)
 
 
 def _stacked(parts: Sequence[Array], gap: int) -> Array:

@@ -50,21 +50,6 @@ def interval_from(entry: str, option: str = "--exclude") -> tuple[str, str]:
     return first.strip(), last.strip()
 
 
-def decimal_from(text: str) -> str:
-    """The decimal sign."""
-    if text not in (".", ","):
-        raise ValueError(f"--decimal {text}: the decimal sign must be a point or a comma.")
-    return text
-
-
-def separator_from(text: str | None) -> str | None:
-    """The separator of cells, one character; None: it is detected."""
-    sign = "\t" if text in ("tab", "\\t") else text
-    if sign is not None and len(sign) != 1:
-        raise ValueError(f"--separator {text}: the separator must be one character, such as ';', or tab.")
-    return sign
-
-
 def sample_of(row: str, first: int) -> int:
     """The sample, from 0, of a row that is given as text."""
     if not row.isdigit():
@@ -176,8 +161,12 @@ class Cells:
     @property
     def wanted(self) -> Wanted:
         """How columns are read that are yet to be named."""
-        how = separator_from(self.separator), decimal_from(self.decimal), self.dates
-        return Wanted((), None, (), tuple(self.missing or ()), *how)
+        if self.decimal not in (".", ","):
+            raise ValueError(f"--decimal {self.decimal}: the decimal sign must be a point or a comma.")
+        sign = "\t" if self.separator in ("tab", "\\t") else self.separator
+        if sign is not None and len(sign) != 1:
+            raise ValueError(f"--separator {sign}: the separator must be one character, such as ';', or tab.")
+        return Wanted((), None, (), tuple(self.missing or ()), sign, self.decimal, self.dates)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,8 +283,7 @@ class Given(Cells):
 
         model, chosen, before = self._begun()
         if tracker is None and (missing := missing_settings(chosen)):
-            typed = " ".join(f"-p {name}=..." for name in missing)
-            names = ", ".join(missing)
+            typed, names = " ".join(f"-p {name}=..." for name in missing), ", ".join(missing)
             raise ValueError(
                 f"--tracker {self.tracker}: {names} must be given: {typed}; `driftfit tune` estimates them from data."
             )
@@ -355,8 +343,11 @@ def reads(command: Callable[..., None]) -> Callable[..., None]:
     options: list[inspect.Parameter] = []
     for one in inspect.signature(command, eval_str=True).parameters.values():
         if is_dataclass(one.annotation):
-            groups[one.name] = one.annotation
-            options += _options_of(one.annotation)
+            groups[one.name], hints = one.annotation, get_type_hints(one.annotation, include_extras=True)
+            for field in fields(one.annotation):
+                default = inspect.Parameter.empty if field.default is MISSING else field.default
+                option = inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default)
+                options.append(option.replace(annotation=hints[field.name]))
         else:
             options.append(one.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
@@ -370,15 +361,3 @@ def reads(command: Callable[..., None]) -> Callable[..., None]:
     run.__annotations__ = {one.name: one.annotation for one in options}
     run.__name__, run.__doc__ = command.__name__, command.__doc__
     return run
-
-
-def _options_of(group: Any) -> list[inspect.Parameter]:
-    """The options that the fields of a dataclass are."""
-    hints = get_type_hints(group, include_extras=True)
-    return [
-        inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[f.name],
-            default=inspect.Parameter.empty if f.default is MISSING else f.default,
-        )
-        for f in fields(group)
-    ]  # fmt: skip

@@ -46,13 +46,9 @@ app = typer.Typer(
 progress = Console(stderr=True)
 
 
-def _output() -> Console:
-    """A console as wide as that of tables printed from Python, or as the terminal if that is narrower."""
-    screen = Console()
-    return Console(width=min(WIDTH, screen.width) if screen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
-
-
-out = _output()
+_screen = Console()
+out = Console(width=min(WIDTH, _screen.width) if _screen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
+"""A console as wide as that of tables printed from Python, or as the terminal if that is narrower."""
 
 
 def say(what: Any, **options: Any) -> None:

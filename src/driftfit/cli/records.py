@@ -5,7 +5,7 @@ answer.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
@@ -148,13 +148,9 @@ def tune(
             models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
         )
     assert isinstance(tuned, Tuned)  # `arrays` are of one output
-    rows = [
-        ("Model", repr(models[0])),
-        ("Tracker", shortened(repr(tuned.tracker))),
-        ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples"),
-        *remarks_of(tuned.left_out),
-    ]
-    say(facts(*rows))
+    likelihood = ("Log-likelihood", f"{tuned.loglik:.6g} of {tuned.used} samples")
+    model, tracker = ("Model", repr(models[0])), ("Tracker", shortened(repr(tuned.tracker)))
+    say(facts(model, tracker, likelihood, *remarks_of(tuned.left_out)))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
     for name, value in tuned.chosen.items():
         low, high = tuned.interval.get(name, (np.nan, np.nan))
@@ -162,19 +158,13 @@ def tune(
     say(table)
     if tuned.at_bound:
         say(Text(f" at a bound of the search: {', '.join(tuned.at_bound)}", "dim"))
-    say(Text(f" To use them: {_flags(given, tuned.tracker)}", "dim"), soft_wrap=True)
+    parts = [f"--tracker {given.tracker}"]
+    for field in given_fields(type(tuned.tracker)):
+        value, default = getattr(tuned.tracker, field.name), np.asarray(field.default)
+        if np.shape(value) != default.shape or not np.all(value == default):
+            parts.append(f"-p {field.name}={_typed(value)}")
+    say(Text(f" To use them: {' '.join(parts)}", "dim"), soft_wrap=True)
     draw(plot, tuned.plot)
-
-
-def _flags(given: Given, tracker: Any) -> str:
-    """The tracker as command line options."""
-    values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}
-    parts = [f"-p {name}={_typed(value)}" for name, (value, default) in values.items() if not _same(value, default)]
-    return " ".join([f"--tracker {given.tracker}", *parts])
-
-
-def _same(value: Any, default: Any) -> bool:
-    return np.shape(value) == np.shape(default) and bool(np.all(value == default))
 
 
 def _typed(value: Any) -> str:
@@ -203,27 +193,16 @@ def select(
     draw(plot, selection.plot)
 
 
-@dataclass(frozen=True)
-class AlarmOptions:
-    """The options that define an alarm."""
-
-    kind: Annotated[str, Option(help="glr or band.")] = "glr"
-    every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0
-    reference: Annotated[
-        list[str] | None,
-        Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
-    ] = None
-
-    def find(self, run: Any) -> Any:
-        """The alarms of a run, an `Outputs` or a fleet."""
-        return run.detect(self.kind, every=self.every, reference=parse_reference(self.reference, run))
-
-
 @app.command()
 @reads
 def detect(
     given: Given,
-    options: AlarmOptions,
+    kind: Annotated[str, Option(help="glr or band.")] = "glr",
+    every: Annotated[float, Option(help="Samples in which one false alarm may begin.")] = 10_000.0,
+    reference: Annotated[
+        list[str] | None,
+        Option(help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."),
+    ] = None,
     labels: Annotated[
         str | None, Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
@@ -237,7 +216,7 @@ def detect(
     check_table(write_to, "alarms are")
     _check_page(given, report, None)
     run = given.run()
-    alarms = options.find(run)
+    alarms = run.detect(kind, every=every, reference=parse_reference(reference, run))
     say(alarms)
     faulty = None
     if labels is not None:

@@ -167,10 +167,6 @@ class Times(NamedTuple):
     labels: bool = False
 
 
-WITHOUT = Times()
-"""Samples that have no times."""
-
-
 def times_of(time: Any, parts: Sequence[Held], dt: Any = None) -> Times:
     """The times that a user passed, or the first index of dates among the signals."""
     if time is None:
@@ -179,7 +175,7 @@ def times_of(time: Any, parts: Sequence[Held], dt: Any = None) -> Times:
                 if dt is None:
                     warn_of_skipped_periods(part.index)
                 return _dates(part.index)._replace(labels=True)
-        return WITHOUT
+        return Times()
     if dated(time):
         return _dates(time)
     if isinstance(time, np.ndarray | list | tuple):

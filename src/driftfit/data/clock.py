@@ -84,7 +84,14 @@ class Clock:
         if isinstance(dt, str):
             return _of_text(dt)
         if isinstance(dt, np.timedelta64 | timedelta):
-            return _of_duration(dt.to_timedelta64() if hasattr(dt, "to_timedelta64") else np.timedelta64(dt), dt)
+            length = dt.to_timedelta64() if hasattr(dt, "to_timedelta64") else np.timedelta64(dt)
+            if np.datetime_data(length.dtype)[0] in ("Y", "M", "generic"):
+                raise ValueError(
+                    f"dt={dt!r} has no fixed length; give dt='month', dt='year', or a unit, as in dt='1s'."
+                )
+            if not length > np.timedelta64(0, "s"):
+                raise ValueError(f"dt must be positive; got {dt!r}.")
+            return cls("duration", duration=length)
         if isinstance(dt, int | float | np.number) and not isinstance(dt, bool):
             if not (dt > 0.0 and np.isfinite(dt)):
                 raise ValueError(f"dt must be positive; got {dt!r}.")
@@ -269,14 +276,6 @@ UNSET = Clock("unset")
 """The clock if no dt was given."""
 
 
-def _of_duration(length: np.timedelta64, given: Any) -> Clock:
-    if np.datetime_data(length.dtype)[0] in ("Y", "M", "generic"):
-        raise ValueError(f"dt={given!r} has no fixed length; give dt='month', dt='year', or a unit, as in dt='1s'.")
-    if not length > np.timedelta64(0, "s"):
-        raise ValueError(f"dt must be positive; got {given!r}.")
-    return Clock("duration", duration=length)
-
-
 def _of_text(text: str) -> Clock:
     """A count and a unit; codes of pandas may contain the month or weekday to which they are anchored."""
     if text.strip() == LABEL:
@@ -341,11 +340,10 @@ def _refuse(given: Any) -> NoReturn:
 
 def duration_text(length: np.timedelta64) -> str:
     """A duration as an integer multiple of the largest possible unit."""
-    for name, one in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
-        if length % np.timedelta64(one, "s") == np.timedelta64(0, "s"):
-            return f"{length // np.timedelta64(one, 's')}{name}"
-    size = next(size for size in ("ms", "us", "ns") if length % _delta(1, size) == _delta(0, size))
-    return f"{length // _delta(1, size)}{size}"
+    units = {name: _delta(DURATIONS[name], "s") for name in ("d", "h", "min", "s")}
+    units |= {name: _delta(1, name) for name in ("ms", "us", "ns")}
+    name = next(name for name, unit in units.items() if not (length % unit).astype(int))
+    return f"{length // units[name]}{name}"
 
 
 PACE_SAMPLES = 20

@@ -92,7 +92,11 @@ def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int, row
     if wanted.time is not None:
         time, zone = times_of_column(frame[wanted.time], where, base, wanted.dates, wanted.missing)
     numbers = {name: numbers_of(frame[name], where, base, wanted.missing) for name in wanted.numbers}
-    return Columns(numbers, time, zone, [_keys(frame[name], wanted.missing) for name in wanted.by], len(frame))
+    keys = [  # in the type of the column: the parts of a table agree on it
+        _as_text(one, wanted.missing).to_list() if _is_text(one) else _values(one.to_list())
+        for one in (frame[name] for name in wanted.by)
+    ]
+    return Columns(numbers, time, zone, keys, len(frame))
 
 
 def plain_names(names: Sequence[str], wanted: Sequence[str]) -> list[str]:
@@ -143,16 +147,13 @@ def numbers_of(series: nw.Series[Any], where: str, base: int, missing: Sequence[
 def _numbers_of_text(text: pl.Series, where: str, base: int) -> Array:
     values = text.cast(pl.Float64, strict=False)
     wrong = (values.is_null() & text.is_not_null()).arg_true()
-    if len(wrong):
+    if count := len(wrong):
+        cell, cells = text[wrong[0]], "1 such cell" if count == 1 else f"{count} such cells"
         raise ValueError(
-            f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is not a number "
-            f"({_count(len(wrong))}); {_advice(text[wrong[0]], wrong.to_list() == [0] and base == 1)}."
+            f"{where}, row {wrong[0] + base} of column {text.name!r} holds {cell!r}, which is not a number ({cells}); "
+            f"{_advice(cell, wrong.to_list() == [0] and base == 1)}."
         )
     return np.array(values.fill_null(np.nan).to_numpy())
-
-
-def _count(wrong: int) -> str:
-    return "1 such cell" if wrong == 1 else f"{wrong} such cells"
 
 
 def _advice(cell: str, second_line: bool) -> str:
@@ -227,11 +228,6 @@ def _dates_of_text(text: pl.Series, where: str, base: int, form: str | None) -> 
             f"or pass the table with polars.col({text.name!r}).str.to_datetime('%d.%m.%Y %H:%M')."
         )
     return found
-
-
-def _keys(series: nw.Series[Any], missing: Sequence[str]) -> list[Any]:
-    """The key of every row's series, or None, in the type of the column: the parts of a table agree on it."""
-    return _as_text(series, missing).to_list() if _is_text(series) else _values(series.to_list())
 
 
 def _values(cells: Iterable[Any]) -> list[Any]:

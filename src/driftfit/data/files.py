@@ -110,12 +110,9 @@ def read_csv(source: str | bytes, wanted: Wanted) -> tuple[list[str], pl.DataFra
         _check_widths(content, sign, len(raw))
         every = pl.read_csv(content, columns=read, truncate_ragged_lines=True, **options)
     units = _units(list(csv.reader(lines, delimiter=sign))[1:], names, wanted)
-    frame = every.slice(bool(units)).select(list(chosen)).rename(chosen)
-    if wanted.decimal == ",":
-        words = (*HISTORIANS, *wanted.missing)
-        frame = frame.with_columns(
-            points(present(frame[name], words)) for name in wanted.signals if name in frame.columns
-        )
+    frame, words = every.slice(bool(units)).select(list(chosen)).rename(chosen), (*HISTORIANS, *wanted.missing)
+    signals = [name for name in wanted.signals if name in frame.columns and wanted.decimal == ","]
+    frame = frame.with_columns(points(present(frame[name], words)) for name in signals)
     keys = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return [*names, *again], frame.with_columns(_whole(column) for column in keys), units
 
@@ -333,7 +330,10 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
     `read_csv` says how CSV is read.
     """
     if (start := start_of(source)).startswith(b"\x1f\x8b"):
-        source = gunzipped(source if isinstance(source, bytes) else Path(source).read_bytes(), where)
+        try:
+            source = gzip.decompress(source if isinstance(source, bytes) else Path(source).read_bytes())
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise ValueError(f"{where} cannot be decompressed: {error}") from None
         start = start_of(source)
     if kind := next((kind for first, kind in OTHER.items() if start.startswith(first)), None):
         raise ValueError(f"{where} is {kind}; write its table to a CSV or Parquet file.")
@@ -348,7 +348,7 @@ def read_file(source: str | bytes, wanted: Wanted, where: str) -> tuple[nw.DataF
             raise ValueError(f"{where} cannot be read as CSV: {' '.join(str(error).split())}") from None
     if not wanted.names:
         return read_file(source, replace(wanted, numbers=tuple(names)), where)
-    for name in (name for name in wanted.names if not (name == FILE and FILE in wanted.by)):
+    for name in (name for name in wanted.names if name != FILE or FILE not in wanted.by):
         if name not in names:
             raise ValueError(f"{where} has no column {name!r}: {near(name, names)}")
         if names.count(name) > 1:
@@ -368,29 +368,18 @@ def together(parts: Mapping[str, Columns]) -> Columns:
         raise ValueError(f"the times of {kinds['f']} are numbers, but those of {kinds['M']} are dates.")
     first = next(iter(parts.values()))
     units = [[value for part in parts.values() for value in part.by[k]] for k in range(len(first.by))]
+    named = [any(isinstance(one, str) for one in column) for column in units]  # in some files by text, so in all
     return Columns(
         {name: np.concatenate([part.numbers[name] for part in parts.values()]) for name in first.numbers},
         np.concatenate(list(times.values())) if times else None,
         first.zone,
-        [_of_one_type(column) for column in units],
+        [
+            [str(one) if isinstance(one, int) else one for one in column] if text else column
+            for column, text in zip(units, named, strict=True)
+        ],
         sum(part.rows for part in parts.values()),
         first.units,
     )
-
-
-def _of_one_type(units: list[Any]) -> list[Any]:
-    """The names of units as text in all files, if some files name units by text and others by integers."""
-    if not any(isinstance(unit, str) for unit in units):
-        return units
-    return [str(unit) if isinstance(unit, int) else unit for unit in units]
-
-
-def gunzipped(data: bytes, where: str) -> bytes:
-    """The contents of a file of gzip."""
-    try:
-        return gzip.decompress(data)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{where} cannot be decompressed: {error}") from None
 
 
 def read_parquet(

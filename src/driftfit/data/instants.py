@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -137,7 +138,12 @@ def instants(time: Any) -> tuple[Array, str | None]:
 def _of_texts(texts: Sequence[str]) -> Array:
     """Dates in the form of ISO 8601, or beginnings of periods."""
     found = periods(texts)
-    days = [_date_of_text(text) for text in texts] if found is None else found
+    days: Any = found
+    if found is None:
+        days = [np.datetime64("NaT", "us")] * len(texts)
+        for k, text in enumerate(texts):
+            with suppress(ValueError):
+                days[k] = np.datetime64(with_hyphens(text), "us")
     for text, day in zip(texts, days, strict=True):
         if np.isnat(day) and text.strip().lower() != "nat":
             raise ValueError(
@@ -157,13 +163,6 @@ def with_hyphens(text: str) -> str:
     if not plain.isdigit() or len(plain) == 4:
         return plain or "NaT"
     return f"{plain[:4]}-{plain[4:6]}-{plain[6:]}" if re.fullmatch(DAY, plain) else "NaT"
-
-
-def _date_of_text(text: str) -> np.datetime64:
-    try:
-        return np.datetime64(with_hyphens(text), "us")
-    except ValueError:
-        return np.datetime64("NaT", "us")
 
 
 def in_zone(table: pl.DataFrame, time: str, zone: str | None) -> pl.DataFrame:

@@ -77,8 +77,7 @@ class Limits:
 
     def inputs(self, u: Array) -> Array:
         """Inputs (.., m) of a query; values outside are not counted."""
-        low, high = self.low[self.ny :], self.high[self.ny :]
-        return np.where((u < low) | (u > high), np.nan, u)
+        return np.where(self.outside(self.low[: self.ny], u)[1], np.nan, u)
 
     def plain(self) -> list[Any]:
         """Ranges and counts as plain data; `restore` takes the counts."""

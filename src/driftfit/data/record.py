@@ -187,26 +187,17 @@ class Records(NamedTuple):
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
         begin, count = self.first.item(k), self.length.item(k)
-        if count == len(self.y):
-            return Record(self.y, self.u, self.known, self.time, self.labels_of(k))
-        rows = slice(begin, begin + count)
-        time = None if self.time is None else self.time[rows]
-        return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
+        whole = Record(self.y, self.u, self.known, self.time, self.labels_of(k))
+        return whole if count == len(self.y) else whole.part(slice(begin, begin + count))
 
     def some(self, a: int, b: int) -> Records:
         """Series a to b - 1; their arrays are views."""
         first, length = self.first[a:b], self.length[a:b]
         low = int(first.min())
         rows = slice(low, int((first + length).max()))
-        return self._replace(
-            keys=self.keys[a:b],
-            first=first - low,
-            length=length,
-            y=self.y[rows],
-            u=self.u[rows],
-            known=self.known.part(rows),
-            time=None if self.time is None else self.time[rows],
-        )
+        time, known = None if self.time is None else self.time[rows], self.known.part(rows)
+        y, u = self.y[rows], self.u[rows]
+        return self._replace(keys=self.keys[a:b], first=first - low, length=length, y=y, u=u, known=known, time=time)
 
     def in_rows(self) -> Records:
         """Series with several outputs as series of one output, whose samples are the outputs of every instant in order.
@@ -229,7 +220,10 @@ class Records(NamedTuple):
         columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
         if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
             raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
-        return self._replace(known=self.known.with_extra(columns), drifts=None)
+        common = self.known.common.over(len(columns)).columns
+        if common.ndim > 2:
+            columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
+        return self._replace(known=Known(np.hstack([common, columns])), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""
@@ -363,13 +357,6 @@ class Known:
         for place, times in factors.items():
             columns[place, INTERVAL] *= times
         return Known(columns)
-
-    def with_extra(self, columns: Array) -> Known:
-        """The same numbers with extra columns (T, k) after interval, noise and drift."""
-        common = self.common.over(len(columns)).columns
-        if common.ndim > 2:
-            columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
-        return Known(np.hstack([common, columns]))
 
     def for_outputs(self, noise: Array) -> Known:
         """The same numbers for each of several outputs, which have separate factors of the noise variance (T, ny)."""

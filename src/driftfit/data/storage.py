@@ -136,7 +136,10 @@ def reading(name: str) -> Iterator[None]:
 
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write a header and arrays as .npz, completely or not at all."""
-    replace_file(path, lambda file: _put(file, header, arrays))
+    # the names of the arrays, because the check sums of a zip cover what it holds, not what that is called
+    text = json.dumps({"format": FORMAT, "arrays": [*arrays], **header}, default=_encode)
+    named: dict[str, Any] = dict(arrays)
+    replace_file(path, lambda file: np.savez(file, header=np.array(text), **named))
 
 
 def replace_file(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
@@ -162,13 +165,6 @@ def read(path: str | PathLike[str], *kinds: str) -> tuple[dict[str, Any], dict[s
     """Header and arrays of a file that holds one of the ``kinds`` ("state", "track"); ValueError where it does not."""
     with open(path, "rb") as handle:
         return expand(handle.read(), kinds, os.fspath(path))
-
-
-def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    # the names of the arrays, because the check sums of a zip cover what it holds, not what that is called
-    text = json.dumps({"format": FORMAT, "arrays": [*arrays], **header}, default=_encode)
-    named: dict[str, Any] = dict(arrays)
-    np.savez(file, header=np.array(text), **named)
 
 
 def compact(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:

@@ -10,7 +10,7 @@ counted.
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -77,8 +77,12 @@ def read_records(
         warn_of_counted_years(times)
         if clock.kind != LABEL:
             warn_of_written_numbers(times)
+    gaps: Any = 1.0
+    if times is not None:
+        gaps = clock.steps(times)
+        gaps[first] = 1.0
     known = Known.of(
-        1.0 if times is None else _gaps(times, first, clock),
+        gaps,
         _factor(weights, values, noise_of),
         _factor(1.0 if each else drift, values, partial(factor, "drift")),
     )
@@ -148,14 +152,10 @@ def _codes(columns: Columns) -> tuple[list[Hashable], Array]:
     if not columns.by:
         return [0], np.zeros(columns.rows, dtype=np.int64)
     index: dict[Hashable, int] = {}
-    rows: Iterator[Hashable] = iter(columns.by[0]) if len(columns.by) == 1 else _tuples(columns.by)
+    tuples = (None if None in row else row for row in zip(*columns.by, strict=True))
+    rows: Iterable[Hashable] = columns.by[0] if len(columns.by) == 1 else tuples
     code = np.fromiter((-1 if key is None else index.setdefault(key, len(index)) for key in rows), np.int64)
     return list(index), code
-
-
-def _tuples(by: Sequence[Sequence[Any]]) -> Iterator[Hashable]:
-    for row in zip(*by, strict=True):
-        yield None if None in row else row
 
 
 def _order(
@@ -182,13 +182,6 @@ def _order(
 def _count(dropped: dict[Hashable, dict[str, int]], keys: Sequence[Hashable], code: Array, reason: str) -> None:
     for k, count in zip(*np.unique(code, return_counts=True), strict=True):
         dropped.setdefault(keys[k], {})[reason] = int(count)
-
-
-def _gaps(time: Array, first: Array, clock: Clock) -> Array:
-    """Nominal intervals since the previous sample of the same unit; 1 at the first."""
-    gaps = clock.steps(time)
-    gaps[first] = 1.0
-    return gaps
 
 
 def _factor(given: Any, values: Mapping[str, Array], convert: Any) -> Array:

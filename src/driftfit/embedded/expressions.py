@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from driftfit.embedded.values import (
     narrow,
     number,
     plain,
+    strides_of,
     view,
 )
 from driftfit.engine import kernel
@@ -157,7 +159,7 @@ class Expressions:
                 inner = inner[one.constant]
             return lifted(inner)
         name, kind = self.unit.table(table.constant)
-        strides = [int(np.prod(np.shape(table.constant)[axis + 1 :])) for axis in range(len(index))]
+        strides = strides_of(np.shape(table.constant))
         at = " + ".join(f"({one.text} * {stride})" for one, stride in zip(index, strides, strict=True))
         most = int(np.max(table.constant)) if kind == "int" else None
         return Value(kind, f"{name}[{at}]", most=most)
@@ -179,16 +181,21 @@ class Expressions:
     def binary(self, operation: ast.operator, one: Value, other: Value) -> Value:
         """One operation on two numbers."""
         one, other = plain(one), plain(other)
-        kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
+        kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= {*RANK} else one.kind
         if one.known and other.known and kind in RANK:
             return number(_folded(operation, one.constant, other.constant))
         if one.kind == "address":  # in bytes
             moved = str(other.constant // 8) if other.known else f"{other.text} / 8"
             return one if other.constant == 0 else Value("address", f"({one.text} + {moved})")
         if isinstance(operation, ast.Pow):
-            return self._square(one, other)
-        if isinstance(operation, ast.LShift | ast.RShift):
-            return _shifted(operation, one, other)
+            if other.constant != 2:
+                raise TranslationError(f"{self.source.__name__}: powers other than squares have no translation.")
+            self.ops[-1]["multiply"] += 1
+            return Value(one.kind, f"real_square({one.text})" if one.kind == "real" else f"({one.text} * {one.text})")
+        if isinstance(operation, ast.LShift):
+            return Value("long", f"((int64_t)((uint64_t){one.text} << {other.text}))")
+        if isinstance(operation, ast.RShift):
+            return Value("long", f"({one.text} >> {other.text})")
         if type(operation) in BITS and kind == "bool" and (one.known or other.known):
             fixed, rest = (one, other) if one.known else (other, one)
             return rest if fixed.constant == isinstance(operation, ast.BitAnd) else fixed
@@ -206,26 +213,14 @@ class Expressions:
         self.ops[-1][{"+": "add", "-": "add", "*": "multiply", "/": "divide"}[sign]] += 1
         return Value("real", f"({_real(one)} {sign} {_real(other)})")
 
-    def _square(self, one: Value, other: Value) -> Value:
-        if other.constant != 2:
-            raise TranslationError(f"{self.source.__name__}: powers other than squares have no translation.")
-        self.ops[-1]["multiply"] += 1
-        return Value(one.kind, f"real_square({one.text})" if one.kind == "real" else f"({one.text} * {one.text})")
-
     def of_compare(self, node: ast.Compare) -> Value:
         values = [self.value(one) for one in (node.left, *node.comparators)]
         if len(values) == 2 and values[0].kind == "flag" and values[1].known:
             return _of_flag(values[0], [PYTHON[type(node.ops[0])](one, values[1].constant) for one in (0.0, 1.0)])
+        pairs = [(type(kind), *pair) for kind, pair in zip(node.ops, pairwise(values), strict=True)]
         if all(one.known for one in values):
-            truths = [
-                PYTHON[type(kind)](one.constant, other.constant)
-                for kind, one, other in zip(node.ops, values, values[1:], strict=False)
-            ]
-            return number(all(truths))
-        tests = [
-            f"{one.text} {COMPARISONS[type(kind)]} {other.text}"
-            for kind, one, other in zip(node.ops, values, values[1:], strict=False)
-        ]
+            return number(all(PYTHON[kind](one.constant, other.constant) for kind, one, other in pairs))
+        tests = [f"{one.text} {COMPARISONS[kind]} {other.text}" for kind, one, other in pairs]
         self.ops[-1]["compare"] += len(tests)
         text = f"({tests[0]})" if len(tests) == 1 else "(" + " && ".join(f"({test})" for test in tests) + ")"
         return Value("bool", text)
@@ -261,7 +256,9 @@ class Expressions:
     def call(self, node: ast.Call, statement: bool) -> Value:
         """A call of another step, or of one of the functions that every step may use."""
         if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
-            return self._reinterpreted(node)
+            inner, to = self.value(node.func.value), self.value(node.args[0]).constant
+            text, kind = ("from_bits", "real") if to is np.float64 else ("bits_of", "long")
+            return Value(kind, f"{text}({inner.text})")
         function = self.value(node.func).constant
         arguments = [plain(self.value(one)) for one in node.args]
         if function in (tracker_part, whole_record):
@@ -269,7 +266,9 @@ class Expressions:
         if function is kernel.packed or (function is kernel.wholes and arguments[0].kind == "items"):
             return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
-            return self._at_address(arguments)
+            # only the first extent may be unknown
+            extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
+            return Value("array", arguments[0].text, shape=tuple(extents), strides=strides_of(tuple(extents)))
         if hasattr(function, "py_func"):
             before = self.ops[-1].copy()
             made = self.called(function.py_func, arguments, statement)
@@ -277,12 +276,6 @@ class Expressions:
                 self.ops[-1] = before  # it seldom runs
             return made
         return self._builtin(node, function, arguments)
-
-    def _at_address(self, arguments: list[Value]) -> Value:
-        """An array with these extents; only the first of them may be unknown."""
-        extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
-        strides = [int(np.prod(extents[axis + 1 :])) for axis in range(len(extents))]
-        return Value("array", arguments[0].text, shape=tuple(extents), strides=tuple(strides))
 
     def _builtin(self, node: ast.Call, function: Any, arguments: list[Value]) -> Value:
         if function in (min, max):
@@ -297,9 +290,7 @@ class Expressions:
             return number(function(one.constant))
         if function is abs:
             self.ops[-1]["add"] += 1
-            return (
-                Value("real", f"R_ABS({one.text})") if one.kind == "real" else Value(one.kind, f"whole_abs({one.text})")
-            )
+            return Value(one.kind, f"{'R_ABS' if one.kind == 'real' else 'whole_abs'}({one.text})")
         if function in (np.sqrt, math.sqrt):
             self.ops[-1]["square root"] += 1
             return Value("real", f"R_SQRT({one.text})")
@@ -326,14 +317,6 @@ class Expressions:
         prefix = "real_" if kind == "real" else "whole_"
         return Value(kind, f"{prefix}{function.__name__}imum({one.text}, {other.text})", most=most)
 
-    def _reinterpreted(self, node: ast.Call) -> Value:
-        """Reinterpret the bits of a number as another type."""
-        assert isinstance(node.func, ast.Attribute)
-        inner, to = self.value(node.func.value), self.value(node.args[0]).constant
-        return (
-            Value("real", f"from_bits({inner.text})") if to is np.float64 else Value("long", f"bits_of({inner.text})")
-        )
-
 
 def _real(value: Value) -> str:
     return value.text if value.kind == "real" or value.known else f"(real){value.text}"
@@ -350,12 +333,6 @@ def _most(sign: str, one: Value, other: Value) -> int | None:
     if other.most is None:
         return None
     return one.most + other.most if sign == "+" else one.most * other.most if sign == "*" else None
-
-
-def _shifted(operation: ast.operator, one: Value, other: Value) -> Value:
-    if isinstance(operation, ast.LShift):
-        return Value("long", f"((int64_t)((uint64_t){one.text} << {other.text}))")
-    return Value("long", f"({one.text} >> {other.text})")
 
 
 def _folded(operation: ast.operator, one: Any, other: Any) -> Any:

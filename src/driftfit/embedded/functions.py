@@ -78,13 +78,11 @@ class Statements(Expressions):
     def on_pass(self, node: ast.Pass) -> None:
         """Nothing."""
 
-    def on_break(self, node: ast.Break) -> bool:
-        self.line("break;")
+    def on_break(self, node: ast.Break | ast.Continue) -> bool:
+        self.line(f"{ast.unparse(node)};")
         return True
 
-    def on_continue(self, node: ast.Continue) -> bool:
-        self.line("continue;")
-        return True
+    on_continue = on_break
 
     def on_annassign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
@@ -177,7 +175,7 @@ class Statements(Expressions):
             return
         name = identifier(node.target.id)
         high, low = (stop, start) if step > 0 else (start, stop)
-        top = self.largest(high)
+        top = high.most if high.most is not None else self.unit.largest  # the largest extent, if it is not known
         turns = max(0, top - (low.constant if low.known else 0))
         turns = -(-turns // abs(step))
         sign = "<" if step > 0 else ">"
@@ -190,10 +188,6 @@ class Statements(Expressions):
         self.forget(node)
         self.line("}")
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
-
-    def largest(self, value: Value) -> int:
-        """Upper bound of a loop, or the largest extent of the record if it is not known."""
-        return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
         self.forget(node)
@@ -265,12 +259,9 @@ class Body(Statements):
             if one.kind in ("record", "tile"):
                 self.parameters += ["tracker_state *s", "scratch_fields *scratch"]
                 named[argument.arg] = one
-            elif one.kind == "array":
-                constant = "const " if one.text == "u" else ""
+            elif one.kind in ("array", "address"):  # an address is one of real numbers
+                constant = "const " if one.kind == "array" and one.text == "u" else ""
                 self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
-                named[argument.arg] = renamed(one, name)
-            elif one.kind == "address":
-                self.parameters.append(f"real *{name}")
                 named[argument.arg] = renamed(one, name)
             elif one.kind == "items":
                 own = [renamed(item, f"{name}{k}") for k, item in enumerate(one.constant)]

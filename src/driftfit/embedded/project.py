@@ -319,14 +319,9 @@ def _after_the_start(made: Translation) -> str:
 
 def _counted(ops: Counter[str]) -> str:
     """Operations in words."""
-    kinds = {
-        "multiply": "multiplication",
-        "add": "addition",
-        "divide": "division",
-        "square root": "square root",
-        "sine": "sine",
-    }
-    parts = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
+    kinds = {"multiply": "multiplication", "add": "addition", "divide": "division"}
+    named = ((kind, kinds.get(kind, kind)) for kind in (*kinds, "square root", "sine"))
+    parts = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in named if ops[kind]]
     return ", ".join(parts[:-1]) + f" and {parts[-1]}" if len(parts) > 1 else "".join(parts)
 
 
@@ -362,21 +357,14 @@ def selftest(model: Model, tracker: Tracker, gate: Gate | None) -> str:
     y, u = record(model, codes=gate is not None)
     live = Live(model, tracker, gate=gate or False)
     steps = np.array([live.update(float(y[t]), u[t, : model.m]) for t in range(SAMPLES)], dtype=float)
-    scales = [
-        max(float(np.max(np.abs(_finite(part)), initial=0.0)), 1e-30)
-        for part in (record(model)[0], steps[:, 2], live.theta)
-    ]  # without codes; fmt: skip
+    usual = (record(model)[0], steps[:, 2], live.theta)  # without codes
+    scales = [max(float(np.max(np.abs(part[np.isfinite(part)]), initial=0.0)), 1e-30) for part in usual]
     last = "state.theta[i]" if len(live.theta) > 1 else "state.theta"
     return filled(
         "selftest.c", T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u),
         steps=_listed(steps), last=last,
         theta=_listed(live.theta), y_scale=repr(scales[0]), s_scale=repr(scales[1]), theta_scale=repr(scales[2]),
     )  # fmt: skip
-
-
-def _finite(values: Array) -> Array:
-    kept: Array = values[np.isfinite(values)]
-    return kept
 
 
 def _listed(values: Any) -> str:

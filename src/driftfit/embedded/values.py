@@ -22,7 +22,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 
-RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4}
+RANK = ("bool", "flag", "int", "long", "real")
 """Kinds of numbers, from narrow to wide."""
 
 BIGGEST_SINGLE, SMALLEST_SINGLE = 1e18, 1e-30
@@ -79,7 +79,7 @@ def literal(x: float) -> str:
 
 def joined(*kinds: str) -> str:
     """The kind of number that can represent all of these."""
-    widest = max(kinds, key=lambda kind: RANK[kind])
+    widest = max(kinds, key=RANK.index)
     return "real" if "flag" in kinds and widest in ("int", "long") else widest
 
 

@@ -55,10 +55,6 @@ class Formula:
         return tuple(lag for name, lag in self.lags if name == signal)
 
 
-def _lag(node: ast.Subscript) -> int:
-    return node.slice.operand.value  # type: ignore[attr-defined,no-any-return]
-
-
 @lru_cache(maxsize=256)
 def parse(text: str, known: bool = False) -> Formula:
     """The parts of a formula; ValueError names the part that is not understood.
@@ -150,8 +146,8 @@ class Writer:
                 return self.let(f"s.point[{i}, l]"), {i: "1.0"} if self.differentiates else {}
             case ast.Name():
                 return (repr(float(np.pi)), {}) if node.id == "pi" else self.signal(node.id, 0)
-            case ast.Subscript():
-                return self.signal(node.value.id, _lag(node))  # type: ignore[attr-defined]
+            case ast.Subscript(value=ast.Name(id=name), slice=ast.UnaryOp(operand=ast.Constant(value=int(lag)))):
+                return self.signal(name, lag)
             case ast.UnaryOp():
                 x, dx = self.write(node.operand)
                 return (self._scaled("-1.0", x, dx)) if isinstance(node.op, ast.USub) else (x, dx)

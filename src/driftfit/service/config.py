@@ -227,8 +227,9 @@ class _Reader:
             )
         program = at("tracker", lambda: Program(model, check_ready(tracker)))
         at("tracker", program.tile)  # whether they fit; nothing is compiled
-        if settings.alarm is not None:
-            at("alarm", partial(_check_alarms, program, settings.alarm))
+        if (alarm := settings.alarm) is not None:
+            for kind in alarm.on:
+                at("alarm", partial(check_alarm, program, asked_for(kind, alarm.each), alarm.reference))
         return settings
 
 
@@ -312,12 +313,6 @@ def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
             raise ValueError(f"every = {every!r} needs dt, the interval between samples; or give a number of samples.")
         given = given | {"every": _seconds("every", every.replace(" ", "")) / dt}
     return build(AlarmSettings, given)
-
-
-def _check_alarms(program: Program, alarm: AlarmSettings) -> None:
-    """Raise ValueError if an alarm cannot be set from its reference."""
-    for kind in alarm.on:
-        check_alarm(program, asked_for(kind, alarm.each), alarm.reference)
 
 
 HEADER = re.compile(r"\s*(\[\[?)\s*([^\]]+?)\s*\]")

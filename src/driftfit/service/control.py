@@ -18,7 +18,8 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from driftfit.service.connect.http import ANSWER_SECONDS, INCOMING, HttpSource
+from driftfit.service.connect.base import ANSWER_SECONDS
+from driftfit.service.connect.http import INCOMING, HttpSource
 from driftfit.service.core.engine import Engine
 
 log = logging.getLogger("driftfit.service")

@@ -268,8 +268,3 @@ def _fields(text: str) -> list[str]:
         return [field for _, field, _, _ in Formatter().parse(text) if field is not None]
     except ValueError as error:
         raise ValueError(f"{text!r}: {error}; braces enclose a name, such as plant/{{pump}}/sensors.") from None
-
-
-def valid_name(topic: str) -> bool:
-    """Whether a topic from outside may name a unit."""
-    return 0 < len(topic) <= NAME_CHARACTERS and topic.isprintable()

@@ -219,14 +219,6 @@ class JsonLines(logging.Formatter):
         return json.dumps(line | extra, default=str)
 
 
-def log_to_stderr(level: str) -> None:
-    handler = logging.StreamHandler()
-    handler.setFormatter(JsonLines())
-    log.handlers[:] = [handler]
-    log.setLevel(level.upper())
-    log.propagate = False
-
-
 def cut_the_tail() -> None:
     """Shorten the longest times from arrival to result.
 
@@ -412,5 +404,9 @@ def rebuild(folder: Path) -> None:
 
 
 def run(config: Config, folder: Path) -> None:
-    log_to_stderr(config.service.log)
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonLines())
+    log.handlers[:] = [handler]
+    log.setLevel(config.service.log.upper())
+    log.propagate = False
     Service(config, folder).run()

@@ -21,7 +21,7 @@ Needs xarray (``pip install "driftfit[xarray]"``).
 from __future__ import annotations
 
 import json
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
@@ -31,12 +31,12 @@ import polars as pl
 
 from driftfit.data.files import without_formulas
 from driftfit.data.instants import in_zone
+from driftfit.data.storage import replace_file
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import of_series, one_of
 from driftfit.run.fleet import Fleet, KeyedResults, Outputs, table_by_key
 from driftfit.run.result import Track
 from driftfit.show.text import key_text
-from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
 
 if TYPE_CHECKING:
@@ -59,10 +59,7 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
         return _of_nothing(result, arrays)
     signals = [_columns(one, arrays) for one in records]
     columns = {name: np.concatenate([part[name] for part in signals]) for name in signals[0]}
-    by = result.labels.by if isinstance(result, Fleet) else ()
-    return in_zone(
-        table_by_key(by, keys, [len(one) for one in records], columns), _time_name(records[0]), records[0].labels.zone
-    )
+    return _of_records(result.labels.by if isinstance(result, Fleet) else (), keys, records, columns)
 
 
 def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> pl.DataFrame:
@@ -72,10 +69,14 @@ def paths_table(fleet: Fleet, paths: Mapping[Hashable, tuple[Array, Array]]) -> 
     runs = [fleet[key] for key in paths]
     theta, std = (np.concatenate(parts) for parts in zip(*paths.values(), strict=True))
     columns = {_time_name(runs[0]): np.concatenate([run.time for run in runs])}
-    columns |= _parameters(runs[0].names, theta, std, None)
-    return in_zone(
-        table_by_key(fleet.by, paths, [len(run) for run in runs], columns), _time_name(runs[0]), runs[0].labels.zone
-    )
+    return _of_records(fleet.by, paths, runs, columns | _parameters(runs[0].names, theta, std, None))
+
+
+def _of_records(
+    by: tuple[str, ...], keys: Iterable[Any], records: Sequence[Single], columns: dict[str, Array]
+) -> pl.DataFrame:
+    table = table_by_key(by, keys, [len(one) for one in records], columns)
+    return in_zone(table, _time_name(records[0]), records[0].labels.zone)
 
 
 class Written(NamedTuple):
@@ -101,9 +102,8 @@ def write_parts(fleets: Iterator[Fleet], to: str | PathLike[str]) -> Written:
         failed |= fleet.failed
         if not len(fleet):
             continue
-        table, file = as_table(fleet), folder / f"part-{k:06d}.parquet"
-        table.write_parquet(file.with_suffix(".partial"))
-        file.with_suffix(".partial").rename(file)
+        table = as_table(fleet)
+        replace_file(folder / f"part-{k:06d}.parquet", table.write_parquet)
         series, rows = series + len(fleet.series()), rows + len(table)
     return Written(folder, series, rows, failed)
 
@@ -218,7 +218,13 @@ def to_table(result: Result, kind: str = "polars", arrays: bool = False) -> Any:
     if kind == "polars":
         return table
     units = units_of(result)
-    return _to_pandas(table, units) if kind == "pandas" else _to_pyarrow(table, units)
+    if kind == "pandas":
+        return _to_pandas(table, units)
+    import pyarrow as pa
+
+    plain = table.to_arrow()
+    fields = [f.with_metadata({"unit": units[f.name]}) if f.name in units else f for f in plain.schema]
+    return plain.cast(pa.schema(fields))
 
 
 def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
@@ -235,25 +241,13 @@ def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
     return frame
 
 
-def _to_pyarrow(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
-    import pyarrow as pa
-
-    plain = table.to_arrow()
-    fields = [f.with_metadata({"unit": units[f.name]}) if f.name in units else f for f in plain.schema]
-    return plain.cast(pa.schema(fields))
-
-
 def to_parquet(result: Result, path: str | PathLike[str]) -> None:
     """Write a result as Parquet; units, model and tracker are stored in the metadata of the file, under "driftfit"."""
     records, _ = _records(result)
-    trackers = dict.fromkeys(repr(one) for run in records for one in trackers_of(run))
+    each = (run.trackers if isinstance(run, Outputs) else (run.tracker,) for run in records)
+    trackers = dict.fromkeys(repr(one) for own in each for one in own)
     about = {"model": repr(records[0].model), "trackers": list(trackers), "units": units_of(result)}
     as_table(result).write_parquet(Path(path), metadata={"driftfit": json.dumps(about)})
-
-
-def trackers_of(run: Single) -> tuple[Tracker, ...]:
-    """The trackers of a record."""
-    return run.trackers if isinstance(run, Outputs) else (run.tracker,)
 
 
 def check_ending(path: str | PathLike[str]) -> str:
@@ -297,8 +291,7 @@ def to_xarray(result: Track | KeyedResults) -> xarray.Dataset:
 
 
 def _dataset(xarray: Any, run: Track) -> xarray.Dataset:
-    labels = run.labels
-    time = (labels.time or "time") if run.timed else "sample"
+    labels, time = run.labels, _time_name(run)
     rows: tuple[str, ...] = (time, "output") if run.rows_per_instant > 1 else (time,)
     inputs = labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[-1]))
     variables = {

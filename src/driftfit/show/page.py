@@ -115,14 +115,8 @@ def _inked(axis: object) -> None:
     axis.tick_params(colors=INK, which="both")
     legend = axis.get_legend()
     titles = [axis.title, axis._left_title] if hasattr(axis, "_left_title") else [axis.title]
-    words = [
-        axis.xaxis.label,
-        axis.yaxis.label,
-        axis.xaxis.get_offset_text(),
-        axis.yaxis.get_offset_text(),
-        *axis.texts,
-    ]
-    for word in (*titles, *words, *(legend.get_texts() if legend else ())):
+    words = [word for side in (axis.xaxis, axis.yaxis) for word in (side.label, side.get_offset_text())]
+    for word in (*titles, *words, *axis.texts, *(legend.get_texts() if legend else ())):
         if word.get_color() in ("black", "k", "#000000"):
             word.set_color(INK)
 

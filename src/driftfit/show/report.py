@@ -94,10 +94,14 @@ def page(run: Track, title: str | None = None, alarms: Alarms | None = None, lab
     labelled = run.labels
     heading = f"{labelled.y} from {', '.join(labelled.u)}" if labelled.u else f"Parameters of {labelled.y}"
     heading = title or heading
+    skipped, out = summary.samples - summary.used, len(health.sentences)
+    counted = (f"{summary.samples} samples", summary.span, f"{summary.used} used", f"{skipped} skipped")
+    state = f"{out} of {len(health.checks)} diagnostics {'is' if out == 1 else 'are'} out of bounds, see below."
+    state = health.no_finding if health.ok else state
     sections = [
         f"<h1>{escape(heading)}</h1>",
-        f'<p class="soft">{escape(_subtitle(run, summary))}</p>',
-        _verdict(truth, health),
+        f'<p class="soft">{escape(", ".join(part for part in counted if part))}</p>',
+        opening((*truth.sentences, state)),
         *([section("Faults and alarms", faults(run, alarms, labels))] if alarms or labels is not None else []),
         section("Parameters over time", picture(plot_parameters(run), run, PARAMETERS)),
         section("Parameters", _parameter_table(summary, truth) + _system_table(run)),
@@ -114,26 +118,6 @@ SIGNALS = (
     "Above: the output (dots) and its prediction one sample before. Below: the prediction error and its 95 % band."
 )
 DIAGNOSTICS = "The innovations (one-step errors), the excitation, and the constancy of the coefficients. Grey: limits."
-
-
-def _subtitle(run: Track, summary: Summary) -> str:
-    parts = [
-        f"{summary.samples} samples",
-        summary.span,
-        f"{summary.used} used",
-        f"{summary.samples - summary.used} skipped",
-    ]
-    return ", ".join(part for part in parts if part)
-
-
-def _verdict(truth: Verdict, health: Diagnosis) -> str:
-    count = len(health.sentences)
-    state = (
-        health.no_finding
-        if health.ok
-        else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
-    )
-    return opening((*truth.sentences, state))
 
 
 def _parameter_table(summary: Summary, truth: Verdict) -> str:
@@ -283,12 +267,9 @@ def _since(
 
 
 def _verdict_of_many(first: tuple[str, ...], verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
-    out = sum(not one.ok for one in health.of.values())
-    known = len(health.known)
+    out, known = sum(not one.ok for one in health.of.values()), len(health.known)
     state = f"{out} of {known} have diagnostics out of bounds." if out else "All diagnostics are within limits."
-    if known == 0:
-        state = "No diagnostic can be computed."
-    return opening((*first, *verdicts.sentences, state))
+    return opening((*first, *verdicts.sentences, state if known else "No diagnostic can be computed."))
 
 
 def _rows(verdicts: ManyVerdicts, health: ManyDiagnoses) -> str:
@@ -324,17 +305,14 @@ def _settings_of_many(
 ) -> str:
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
+    without = "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20])
+    missing = counts(sum((Counter(run.labels.missing) for run in runs.values()), Counter()))
     pairs = [
         ("Model", "; ".join(models) if len(models) < LISTED_BY_NAME else f"{len(models)} different ones"),
         ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
-        (
-            "Without a result",
-            "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20]) or "none",
-        ),
-        ("Rows left out", counts(dropped) or "none"),
-        ("Taken as missing", counts(sum((Counter(run.labels.missing) for run in runs.values()), Counter())) or "none"),
-        ("Made by", f"driftfit {__version__}"),
-    ]
+        ("Without a result", without or "none"), ("Rows left out", counts(dropped) or "none"),
+        ("Taken as missing", missing or "none"), ("Made by", f"driftfit {__version__}"),
+    ]  # fmt: skip
     return facts(pairs)
 
 
@@ -359,9 +337,9 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
     strange = [key for key in labels if key not in runs]
     if strange:
         raise ValueError(f"report: labels name {strange[0]!r}, which has no result.")
-    rows = []
+    rows, given = [], {key: marks("report", labels[key], len(runs[key])) for key in labels}
     for key in dict.fromkeys([*watched, *labels]):
-        wrong = marks("report", labels[key], len(runs[key])) if key in labels else np.zeros(len(runs[key]), bool)
+        wrong = given.get(key, np.zeros(len(runs[key]), bool))
         begun, row = onsets(wrong), watched.get(key)
         marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
         cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
@@ -375,19 +353,11 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
     shown = [row for row in watched.values() if row.onsets][:PICTURES]
     pictures = (
         f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
-        f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        f"{picture(row.alarms.plot(given.get(row.key)), runs[row.key], PICTURE)}</div>"
         for row in shown
     )
-    return table(
-        f"Intervals labelled as wrong, and alarms.{of_all(len(rows), FAULTS_LISTED)}",
-        heads,
-        rows[:FAULTS_LISTED],
-        (2, 4),
-    ) + "".join(pictures)
-
-
-def _given(runs: Mapping[Hashable, Track], labels: Mapping[Hashable, Array], key: Hashable) -> Array | None:
-    return marks("report", labels[key], len(runs[key])) if key in labels else None
+    caption = f"Intervals labelled as wrong, and alarms.{of_all(len(rows), FAULTS_LISTED)}"
+    return table(caption, heads, rows[:FAULTS_LISTED], (2, 4)) + "".join(pictures)
 
 
 def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:

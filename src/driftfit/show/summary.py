@@ -130,7 +130,7 @@ def summarise(run: Track) -> Summary:
     """Build the summary of a run; of outputs that share one theta that of all rows."""
     remarks, run = _of_each_output(run), run.rows
     burn = left_at_start(run)
-    low, high = run.band(0.95)
+    low, high = run.band(LEVEL)
     path = run.theta[burn:] if len(run) > burn else run.theta[-1:]
     rows = tuple(
         Row(
@@ -139,11 +139,11 @@ def summarise(run: Track) -> Summary:
         )
         for i, name in enumerate(run.names)
     )  # fmt: skip
-    tracker = shortened(repr(run.tracker))
+    span = " to ".join(run.time_text(t) for t in (0, -1)) if run.timed else ""
     return Summary(
-        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, information(run, 0, 2.0),
-        information(run, 0), burn, rows, compare(run),
-        _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", _span(run), counts(run.labels.dropped),
+        repr(run.model), shortened(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik,
+        information(run, 0, 2.0), information(run, 0), burn, rows, compare(run),
+        _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", span, counts(run.labels.dropped),
         (*remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
@@ -173,16 +173,14 @@ def _signals(labels: Labels) -> str:
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
 
 
-def _resolution(run: Track) -> tuple[tuple[str, str], ...]:
-    """The step of a coarse meter, where a gate or the tracker looked for it."""
-    floor = float(run.state["floor"])
-    said = f"steps of {np.sqrt(12.0 * floor):.4g}, whose rounding has a variance of {floor:.3g}"
-    return (("Resolution", said),) if floor > 0.0 else ()
-
-
 def _gate(run: Track) -> tuple[tuple[str, str], ...]:
-    """What the gate left out, a line for each reason, and the step of a coarse meter."""
-    left = (*remarks_of(run.left_out), *_resolution(run))
+    """What the gate left out, a line for each reason, and the step of a coarse meter, where gate or tracker looked for
+    it.
+    """
+    left, floor = remarks_of(run.left_out), float(run.state["floor"])
+    if floor > 0.0:
+        step = f"steps of {np.sqrt(12.0 * floor):.4g}, whose rounding has a variance of {floor:.3g}"
+        left = (*left, ("Resolution", step))
     return left or (() if run.program.gate is None else (("Gate", "nothing left out"),))
 
 
@@ -228,24 +226,15 @@ def _middle(x: Array) -> tuple[float, float]:
     return (middle, spread / 0.6745) if spread > 0.0 else (float(np.mean(known)), float(np.std(known)))
 
 
-def _span(run: Track) -> str:
-    """First and last time."""
-    if not run.timed:
-        return ""
-    first, last = (run.time_text(t) for t in (0, -1))
-    return f"{first} to {last}"
-
-
 ROWS_SHOWN = 20
 """Rows of the table in a notebook, and series in the summary of a fleet."""
 LEVEL = 0.95
 
-_Line = tuple[str, str, float, float, float]
-
 
 def cell_of(result: Track | KeyedResults) -> str:
-    """One line about the result and a table, as HTML."""
-    rows, count = _rows(result)
+    """One line about the result and a table, as HTML: every parameter of every lane."""
+    lanes = [("", result)] if isinstance(result, Track) else [(key_text(key), run) for key, run in result.items()]
+    rows, count = (row for lane in lanes for row in _own(*lane)), sum(len(run.names) for _, run in lanes)
     table = table_of("Parameters after the last sample", "", "", "theta", "std", "[0.025", "0.975]", names=2)
     for key, name, theta, std, half in islice(rows, ROWS_SHOWN):
         band = (digits(value, std) for value in (theta - half, theta + half))
@@ -254,15 +243,8 @@ def cell_of(result: Track | KeyedResults) -> str:
     return html_of(Text(repr(result)), table, *more)
 
 
-def _rows(result: Track | KeyedResults) -> tuple[Iterator[_Line], int]:
-    """(key, name, theta, std, half the band) of every parameter of every lane, and how many there are."""
-    if isinstance(result, KeyedResults):
-        lanes = ((key_text(key), run) for key, run in result.items())
-        return (row for key, run in lanes for row in _own(key, run)), sum(len(run.names) for run in result.values())
-    return _own("", result), len(result.names)
-
-
-def _own(key: str, run: Track) -> Iterator[_Line]:
+def _own(key: str, run: Track) -> Iterator[tuple[str, str, float, float, float]]:
+    """(key, name, theta, std, half the band) of every parameter of a lane."""
     # the lane's own end, which is cheap; a whole path of standard deviations is not
     theta, std = run.theta[-1], np.sqrt(run.var[-1])
     half = quantile(LEVEL) * std * (band_ratio(run.state["count"], LEVEL) if run.tracker.learns_noise else 1.0)
@@ -317,11 +299,6 @@ class FleetSummary(Printed):
             ("Taken as missing", counts(self.missing)),
             *self.left_out,
         )
-        yield from self._ranking()
-        for key, reason in list(self.failed.items())[:ROWS_SHOWN]:
-            yield Text(f" no result for {key_text(key)}: {reason}")
-
-    def _ranking(self) -> RenderResult:
         what = "std" if self.scaled else "x median"
         heads = ("", "parameter", what, "start", "farthest", "last", "rms e", "persist.")
         table = table_of("Series by how much they moved", *heads, names=2)
@@ -333,6 +310,8 @@ class FleetSummary(Printed):
         yield table
         if len(self.units) > ROWS_SHOWN:
             yield Text(f" and {len(self.units) - ROWS_SHOWN} that moved less", "dim")
+        for key, reason in list(self.failed.items())[:ROWS_SHOWN]:
+            yield Text(f" no result for {key_text(key)}: {reason}")
 
 
 def summarise_fleet(fleet: KeyedResults) -> FleetSummary:
@@ -346,9 +325,7 @@ def summarise_fleet(fleet: KeyedResults) -> FleetSummary:
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)
     trackers = tuple(dict.fromkeys(repr(run.tracker) for run in runs))
-    missing: Counter[str] = Counter()
-    for run in runs:
-        missing.update(run.labels.missing)
+    missing = sum((Counter(run.labels.missing) for run in runs), Counter[str]())
     return FleetSummary(
         repr(fleet.model), trackers, tuple(units), dict(fleet.failed), fleet.dropped, scaled, dict(missing),
         remarks_of({k: run.left_out for k, run in enumerate(runs)}),

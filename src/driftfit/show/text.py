@@ -22,27 +22,27 @@ from driftfit.engine.kernel import Array
 WIDTH = 96
 
 
-def printed(*parts: Any) -> str:
-    """The output of a console of `WIDTH` columns as plain text, the same wherever Python runs.
+def _console(parts: tuple[Any, ...], **options: Any) -> Console:
+    """A console of `WIDTH` columns with some output, the same wherever Python runs.
 
     By default rich sends output to the display of a notebook, and takes colours and widths from the environment.
     """
-    text = StringIO()
-    console = Console(
-        file=text, width=WIDTH, height=100, color_system=None, force_jupyter=False, force_terminal=False,
-        legacy_windows=False,
-    )  # fmt: skip
+    fixed: dict[str, Any] = dict.fromkeys(("force_jupyter", "force_terminal", "legacy_windows"), False)
+    console = Console(file=StringIO(), width=WIDTH, height=100, **fixed, **options)
     console.print(*parts)
+    return console
+
+
+def printed(*parts: Any) -> str:
+    """The output of a console as plain text."""
+    text = _console(parts, color_system=None).file
+    assert isinstance(text, StringIO)
     return text.getvalue()
 
 
 def html_of(*parts: Any) -> str:
     """The same text as HTML, with its bold and dim letters."""
-    console = Console(
-        file=StringIO(), width=WIDTH, height=100, record=True, force_jupyter=False, force_terminal=False,
-        legacy_windows=False,
-    )  # fmt: skip
-    console.print(*parts)
+    console = _console(parts, record=True)
     style = "white-space:pre;overflow-x:auto;line-height:normal;font-family:Menlo,Consolas,monospace"
     return console.export_html(inline_styles=True, code_format=f'<pre style="{style}">{{code}}</pre>')
 

@@ -246,11 +246,10 @@ class AdaptiveKalman(Tracker):
 
     def __post_init__(self) -> None:
         if self.groups is not None:
-            groups = tuple(
-                tuple(whole("AdaptiveKalman", "an index in groups", i, 0) for i in group) for group in self.groups
-            )
+            index = partial(whole, "AdaptiveKalman", "an index in groups", low=0)
+            groups = tuple(tuple(map(index, group)) for group in self.groups)
             members = [i for group in groups for i in group]
-            if len(set(members)) != len(members) or not all(members_of for members_of in groups):
+            if len(set(members)) != len(members) or not all(groups):
                 raise ValueError(f"AdaptiveKalman: groups must be disjoint and not empty; got {self.groups!r}.")
             self._set("groups", groups)
         if self.volatility is not None:

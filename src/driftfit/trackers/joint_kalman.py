@@ -40,15 +40,12 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import one_of
 from driftfit.models.state_space import StateSpace, equations_of
-from driftfit.trackers.forms.covariance import correct, read_drift, symmetric_product
+from driftfit.trackers.forms.covariance import LEFT, correct, read_drift, symmetric_product
 from driftfit.trackers.kalman import drift_matrix
 from driftfit.trackers.state_space.tracker import StateSpaceTracker
 
 REPEAT_LIMIT = 1000.0
 """Times that equations are repeated for one gap, at most."""
-
-KNOWN = 1e-14
-"""Share of a variance below which it is a combination of others."""
 
 
 @kernel
@@ -170,7 +167,7 @@ def factorise(s: State, scale: float, l: int) -> None:
         pivot = s.P[j, j, l]
         for k in range(j):
             pivot -= s.L[j, k, l] * s.L[j, k, l]
-        root = np.sqrt(pivot) if pivot > KNOWN * s.P[j, j, l] else 0.0
+        root = np.sqrt(pivot) if pivot > LEFT * s.P[j, j, l] else 0.0  # or a combination of others
         s.L[j, j, l] = root
         for i in range(j + 1, n):
             total = s.P[i, j, l]

@@ -160,22 +160,19 @@ class Kalman(Tracker):
 
     def state(self, n: int) -> Mapping[str, Any]:
         together, theta0 = np.ndim(self.q) == 2, vector("Kalman", "theta0", self.theta0, n)
+        p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
         return {
             "theta": theta0,
-            "P": np.zeros((n, n)) if self.p0 is None else matrix("Kalman", "p0", self.p0, n),
+            "P": np.zeros((n, n)) if p0 is None else p0,
             "q": matrix("Kalman", "q", self.q, n) if together else vector("Kalman", "q", self.q, n),
             "r": self.r,
             "g": np.zeros(n),
             "drift_root": np.ones(n),
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **before_any_sample(n, self.p0),
-            **(self._root(n) if self.form == "sqrt" else {}),
+            **(square_root.state(theta0, p0) if self.form == "sqrt" else {}),
             **self._noise(),
         }
-
-    def _root(self, n: int) -> Mapping[str, Any]:
-        p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
-        return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
     def partly_known(self, n: int, N: int) -> Mapping[str, Any] | None:
         return None if self.laws else partly_known(self.state(n), self.state(N))

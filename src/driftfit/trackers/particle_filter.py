@@ -97,19 +97,15 @@ class ParticleFilter(StateSpaceTracker):
         }  # fmt: skip
 
     def steps_of(self, model: StateSpace) -> TrackerSteps:
-        chosen = self._drifting(model) if self.sampled is None else self.sampled
+        chosen = model.hidden if self.sampled is None else self.sampled
+        if self.sampled is None and self.q is not None:  # one without drift would be drawn once, and copies remain
+            variance = dict(zip(model.names, np.diag(self.drift_of(model)), strict=True))
+            chosen = tuple(name for name in chosen if variance[name] > 0.0)
         for one in chosen:
             if one not in model.names:
                 raise ValueError(f"ParticleFilter: sampled names {one!r}; {near(one, model.names)}")
         places = tuple(sorted(model.names.index(one) for one in chosen))
         return steps(model.equations, model.input_names, len(model.hidden), model.system.timed, places)
-
-    def _drifting(self, model: StateSpace) -> tuple[str, ...]:
-        """States with drift: one that has none would be drawn once, at the first sample, and copies remain."""
-        if self.q is None:
-            return model.hidden
-        variance = np.diag(self.drift_of(model))
-        return tuple(name for name in model.hidden if variance[model.names.index(name)] > 0.0)
 
     def widen(self, lane: Mapping[str, Any], p: Any) -> None:
         super().widen(lane, p)

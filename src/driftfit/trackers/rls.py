@@ -65,23 +65,6 @@ RECENT, RECENT_SHARE, LATER_SHARE = 20.0, 0.125, 0.25
 """Memory of the present noise variance: samples, and shares of those so far for the unit of P and for the scale."""
 
 
-def no_settling() -> dict[str, Any]:
-    """Fields of a start that is not forgotten, before the first sample."""
-    return {
-        "discounted": 0.0, "first_memory": 0.0, "faded_at": 0.0,
-        "unequal": 0.0, "recent": 0.0, "least": 0.0, "quieter": 1.0,
-    }  # fmt: skip
-
-
-def settling_of(model: Model) -> dict[str, Any]:
-    """Those that a model gives."""
-    one = model.linearised
-    if one is None:
-        return {}
-    N = one.settling
-    return {"discounted": N, "first_memory": one.settling_memory, "unequal": N if one.unequal_start else 0.0}
-
-
 @kernel
 def growth(s: State, l: int) -> float:
     """The factor by which forgetting multiplies P."""
@@ -293,13 +276,18 @@ class Forgetting(Tracker):
             "g": np.zeros(n),
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
-            **no_settling(),
+            **dict.fromkeys(("discounted", "first_memory", "faded_at", "unequal", "recent", "least"), 0.0),
+            "quieter": 1.0,
             **no_scale(),
             **before_any_sample(n, self.p0),
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(model.n), **settling_of(model)}
+        state, one = self.state(model.n), model.linearised
+        if one is None:
+            return state
+        N = one.settling
+        return {**state, "discounted": N, "first_memory": one.settling_memory, "unequal": N * one.unequal_start}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -121,9 +121,7 @@ class Flow:
         other = np.where(stays & ~over, late.WAITING, REFUSED)
         fate = np.where(good[known.code[order]], late.ended(fates.fate, over), other)
         earlier = known.counts[:, SAMPLES].copy()
-        frozen = any(
-            one is not None and one.kind == "glr" for one in self.rules
-        )  # these need what the tracker receives
+        frozen = any(one is not None and one.kind == "glr" for one in self.rules)  # needs what the tracker receives
         done = known.run(order[fate == late.RELEASED], frozen)
         if done is not None:
             alarms = self._watched(known, done, earlier) if any(self.rules) else {}
@@ -311,7 +309,7 @@ def track(
     task = task_of(df, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays, gate)
     rows = rows_of(df, task, settings)
     made = schema_of(task, dict(rows.dtypes), outputs)
-    return by_unit(rows, task, partial(_work, task, outputs, made), made)
+    return by_unit(rows, task, Partition(task, outputs, made).work, made)
 
 
 def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, str]:
@@ -328,16 +326,6 @@ def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, s
     return own | parameters_schema(task) | sums | counts | {"failed": "string"}
 
 
-def _work(
-    task: Task, outputs: str, schema: Mapping[str, str], batches: Iterator[pa.RecordBatch]
-) -> Iterator[pa.RecordBatch]:
-    """What a partition runs."""
-    part = Partition(task, outputs, schema)
-    for table, more in chunks(batches, task.by, parts=outputs != "verdict"):
-        for found in part.run(table, more):
-            yield from found.to_batches()
-
-
 class Partition:
     """The units of a partition, one piece after the other."""
 
@@ -345,6 +333,12 @@ class Partition:
         self.task, self.outputs, self.schema = task, outputs, schema
         self._going: Units | None = None
         """The part before of a unit that is cut into parts."""
+
+    def work(self, batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        """What a partition runs."""
+        for table, more in chunks(batches, self.task.by, parts=self.outputs != "verdict"):
+            for found in self.run(table, more):
+                yield from found.to_batches()
 
     def run(self, table: pa.Table, more: bool) -> Iterator[pa.Table]:
         """Results of some rows; ``more`` if their only unit continues in the next call."""
@@ -378,9 +372,8 @@ class Partition:
         own = self._named(units, which)
         if self.outputs == "states":
             return own | {"state": [units.state(k) for k in which], "settings": [units.settings[k] for k in which]}
-        theta, var = (
-            np.array([units.joint(k).field(units.words[k], name) for k in which]) for name in ("theta", "var")
-        )
+        fields = ([units.joint(k).field(units.words[k], name) for k in which] for name in ("theta", "var"))
+        theta, var = map(np.array, fields)
         sums = units.squares[which]
         with np.errstate(invalid="ignore", divide="ignore"):
             rms, standardised = (np.sqrt(sums[..., j] / sums[..., JUDGED]) for j in (SQUARES, STANDARD))

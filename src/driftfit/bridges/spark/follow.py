@@ -309,8 +309,9 @@ class _Batches:
             kept = self.store.read(*NEXT, batches=[before])
             which = F.when(F.col("kind") == "state", F.lit(OLD)).otherwise(F.lit(WAITED))
             parts.append(kept.withColumn("_kind", which).select(*task.columns, *flow.state, "_kind"))
-            if self.expire is not None:
-                expired = self._oldest(kept)
+            newest = None if self.expire is None else kept.agg({"newest": "max"}).first()[0]
+            if newest is not None:  # units whose newest time is before this have been silent for too long
+                expired = (newest if isinstance(newest, float) else np.datetime64(newest, "us")) - self.expire
         elif self.initial is not None:
             parts.append(begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
         every = parts[0]
@@ -322,13 +323,6 @@ class _Batches:
         own = [SETTING + name for name in task.settings]
         every = every.select(*task.columns, *flow.state, *own, "_kind")
         return by_unit(every, task, partial(flow.work, expired=expired), flow.schema, ["_kind"])
-
-    def _oldest(self, kept: Any) -> Any:
-        """The time before which a unit has been silent for too long."""
-        newest = kept.agg({"newest": "max"}).first()[0]
-        if newest is None:
-            return None
-        return newest - self.expire if isinstance(newest, float) else np.datetime64(newest, "us") - self.expire
 
 
 def begun(initial: Any, task: Task) -> Any:

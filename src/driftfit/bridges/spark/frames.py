@@ -53,8 +53,17 @@ def task_of(
             tracker = {name: tracker[name] for name in names["y"]}
     if not names["by"]:
         raise ValueError("spark: by= names the columns that identify units; a single series runs on one machine.")
-    _check_types(df, names)
-    kind = dict(df.dtypes)[names["time"][0]]
+    kinds = dict(df.dtypes)
+    for argument, allowed in (("by", KEYS), ("time", TIMES), ("y", NUMBERS), ("u", NUMBERS)):
+        for name in names[argument]:
+            if name not in kinds:
+                raise ValueError(f"spark: {argument}: there is no column {name!r}: {near(name, list(kinds))}")
+            if kinds[name].partition("(")[0] not in allowed:
+                raise ValueError(
+                    f"spark: {argument}: column {name!r} is of type {kinds[name]}; it must be one of "
+                    f"{', '.join(allowed)}. Cast it first: df.withColumn({name!r}, F.col({name!r}).cast('double'))."
+                )
+    kind = kinds[names["time"][0]]
     dated = kind in ("timestamp", "timestamp_ntz", "date")
     zone = df.sparkSession.conf.get("spark.sql.session.timeZone") if kind == "timestamp" else None
     own = () if settings is None else _settings(settings, tracker, names["by"])
@@ -74,20 +83,6 @@ def _names(argument: str, value: Any) -> tuple[str, ...]:
     if not all(isinstance(name, str) for name in given):
         raise ValueError(f"spark: {argument}= takes names of columns; got {value!r}.")
     return given
-
-
-def _check_types(df: Any, names: Mapping[str, Sequence[str]]) -> None:
-    """ValueError for a column that does not exist or has a type that cannot be used."""
-    kinds = dict(df.dtypes)
-    for argument, allowed in (("by", KEYS), ("time", TIMES), ("y", NUMBERS), ("u", NUMBERS)):
-        for name in names[argument]:
-            if name not in kinds:
-                raise ValueError(f"spark: {argument}: there is no column {name!r}: {near(name, list(kinds))}")
-            if kinds[name].partition("(")[0] not in allowed:
-                raise ValueError(
-                    f"spark: {argument}: column {name!r} is of type {kinds[name]}; it must be one of "
-                    f"{', '.join(allowed)}. Cast it first: df.withColumn({name!r}, F.col({name!r}).cast('double'))."
-                )
 
 
 def _settings(settings: Any, tracker: Any, by: Sequence[str]) -> tuple[str, ...]:
@@ -124,8 +119,8 @@ def rows_of(df: Any, task: Task, settings: Any) -> Any:
     return rows.join(settings.select(*task.by, *own), on=list(task.by), how="left")
 
 
-JAVA = (17, 21)
-"""Versions of Java with which PySpark 4 runs."""
+OLDEST_JAVA = 17
+"""The oldest version of Java with which PySpark 4 runs; 21 is the newest."""
 
 
 def java() -> tuple[str | None, int | None]:
@@ -153,7 +148,7 @@ def missing() -> str:
             "Spark needs Java 17 or 21, and no java is on the PATH or in JAVA_HOME: install it, as by "
             "apt-get install openjdk-17-jre-headless."
         )
-    if version is not None and version < JAVA[0]:
+    if version is not None and version < OLDEST_JAVA:
         return f"Spark needs Java 17 or 21; {path} is version {version}. Install one and set JAVA_HOME."
     return ""
 

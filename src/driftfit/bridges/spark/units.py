@@ -85,7 +85,7 @@ class Task:
 
     def __reduce__(self) -> Any:
         """Without what was made here."""
-        return _task, ({name: getattr(self, name) for name in self.__dataclass_fields__},)
+        return Task, tuple(getattr(self, name) for name in self.__dataclass_fields__)
 
     def joint_of(self, settings: str | None, tracker: Any) -> JointLayout:
         """The programs of a unit with these settings (JSON); ValueError if they are not complete."""
@@ -109,10 +109,6 @@ class Task:
         given = table.select([SETTING + name for name in self.settings]).take(first).to_pylist()
         rows = [{name.removeprefix(SETTING): v for name, v in row.items() if v is not None} for row in given]
         return [json.dumps(row, sort_keys=True, default=float) if row else None for row in rows]  # of decimals
-
-
-def _task(fields: Mapping[str, Any]) -> Task:
-    return Task(**fields)
 
 
 def trackers_of(tracker: Any) -> tuple[Tracker, ...]:

@@ -111,16 +111,16 @@ def decode(topic: str, payload: bytes | str) -> Samples:
         data = _DECODE.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         data = _with_nan(payload)
-    if isinstance(data, list):
-        return _bounded_rows(topic, data)
-    if len(data) > MESSAGE_FIELDS:
-        raise ShapeError(f"{len(data)} fields; at most {MESSAGE_FIELDS} are read.")
-    sizes = {name: len(value) for name, value in data.items() if isinstance(value, list)}
+    rows = bounded(len(data)) if isinstance(data, list) else 0
+    columns = of_rows(topic, data).columns if rows else data
+    if len(columns) > MESSAGE_FIELDS:
+        raise ShapeError(f"{len(columns)} fields; at most {MESSAGE_FIELDS} are read.")
+    sizes = {name: len(value) for name, value in columns.items() if isinstance(value, list)}
     lengths = set(sizes.values())
     if len(lengths) > 1:
         found = ", ".join(f"{name[:50]} {size}" for name, size in list(sizes.items())[:8])
         raise ShapeError(f"lists of different lengths ({found}); give one number per sample in each, null if missing.")
-    return Samples(topic, bounded(lengths.pop() if lengths else 1), data)
+    return Samples(topic, rows or bounded(lengths.pop() if lengths else 1), columns)
 
 
 def _with_nan(payload: bytes | str) -> Any:
@@ -132,14 +132,6 @@ def _with_nan(payload: bytes | str) -> Any:
         return msgspec.convert(json.loads(raw), dict[str, Cell | list[Cell]] | list[dict[str, Cell]])
     except (ValueError, msgspec.ValidationError, RecursionError):
         raise ValueError("not JSON.") from None
-
-
-def _bounded_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
-    bounded(len(rows))
-    found = of_rows(topic, rows)
-    if len(found.columns) > MESSAGE_FIELDS:
-        raise ShapeError(f"{len(found.columns)} fields; at most {MESSAGE_FIELDS} are read.")
-    return found
 
 
 def of_rows(topic: str, rows: list[dict[str, Any]]) -> Samples:
@@ -165,10 +157,6 @@ def bounded(count: int) -> int:
 
 def number(cell: Any) -> float:
     """A cell as a number; NaN if it is none."""
-    if type(cell) is float:
-        return cell
-    if cell is None or isinstance(cell, bool):
-        return math.nan if cell is None else float(cell)
     try:
         return float(cell)
     except (TypeError, ValueError, OverflowError):
@@ -177,13 +165,11 @@ def number(cell: Any) -> float:
 
 def seconds(cell: Any, scale: float) -> float:
     """A time as seconds: a number in units of ``scale`` seconds, or a date in ISO 8601, in UTC unless it has a zone."""
-    if isinstance(cell, str):
-        try:
-            date = datetime.fromisoformat(cell)
-        except ValueError:
-            return number(cell) * scale
-        return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-    return number(cell) * scale
+    try:
+        date = datetime.fromisoformat(cell)
+    except (TypeError, ValueError):  # no text, or no date
+        return number(cell) * scale
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
 def numbers_of(cells: list[Any]) -> Array:
@@ -201,7 +187,7 @@ def seconds_of(cells: list[Any], scale: float) -> Array:
 
 
 ANSWER_SECONDS = 20.0
-"""In this time a broker or a server must have answered."""
+"""In this time a broker, a server or the journal must have answered."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, ClassVar, Literal
@@ -26,6 +27,8 @@ from urllib.parse import urlsplit
 import msgspec
 
 from driftfit.service.connect.base import (
+    ANSWER_SECONDS,
+    NAMED_SAMPLES,
     NO_SIGNAL,
     TOO_MANY_NEW,
     Batch,
@@ -43,8 +46,6 @@ from driftfit.service.connect.base import (
 )
 from driftfit.service.options import Secret
 
-ANSWER_SECONDS = 30.0
-"""After this time a request that is not yet journaled is answered with an error."""
 SENT_BEFORE = frozenset({"late", "duplicate"})
 """Reasons for which a sender need not mend anything: it has sent the samples before, or others were faster."""
 TOO_FAST = frozenset({"flood", TOO_MANY_NEW})
@@ -96,9 +97,10 @@ class Incoming:
         if not done.wait(ANSWER_SECONDS):
             return {"error": "the journal does not take samples now; try again later", "status": 503}
         received, left_out = sum(one.length for one in samples), receipt.left_out
-        answer: dict[str, Any] = {"received": received, "refused": refused[:20], "left_out": dict(left_out)}
+        refused = refused[:NAMED_SAMPLES]
+        answer: dict[str, Any] = {"received": received, "refused": refused, "left_out": dict(left_out)}
         if not samples:
-            error = "; ".join(refused[:20]) or "the body has no topic."
+            error = "; ".join(refused) or "the body has no topic."
             return answer | {"error": error, "status": 422 if shaped else 400}
         if receipt.missing:
             answer["missing"] = receipt.missing
@@ -137,21 +139,13 @@ def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str], bool]:
 
 def _payloads(body: bytes) -> Mapping[str, Any] | None:
     """The payload of each topic; also of JSON with NaN or Infinity, which Python's own encoder writes."""
-    try:
+    with suppress(msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         found: Mapping[str, Any] = _BODY.decode(body)
         return found
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        pass
-    if b"NaN" not in body and b"Infinity" not in body:
-        return None
-    try:
-        parts = json.loads(body)
-        return {name: json.dumps(one).encode() for name, one in parts.items()} if isinstance(parts, dict) else None
-    except (ValueError, RecursionError):
-        return None
-
-
-ANSWER_SECONDS = 10.0
+    with suppress(ValueError, RecursionError):
+        if (b"NaN" in body or b"Infinity" in body) and isinstance(parts := json.loads(body), dict):
+            return {name: json.dumps(one).encode() for name, one in parts.items()}
+    return None
 
 
 @dataclass(frozen=True)

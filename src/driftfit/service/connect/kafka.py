@@ -26,8 +26,6 @@ from driftfit.service.connect.base import (
 )
 from driftfit.service.connect.mqtt import messages
 
-FLUSH_SECONDS = 30.0
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Cluster(Connector):
@@ -115,18 +113,14 @@ class _Writer(Writer):
         self.options = options
         given = {"bootstrap.servers": options.brokers, "enable.idempotence": True, "linger.ms": 5} | options.settings
         self.producer = options.library().Producer(given)
-        self.failed: list[str] = []
 
     def write(self, batch: Outcome) -> None:
+        failed: list[Any] = []
         for unit, is_event, body in messages(batch, self.options.every_result):
             topic = self.options.topic + "-events" * is_event
-            self.producer.produce(topic, body, unit.encode(), on_delivery=self._delivered)
+            self.producer.produce(topic, body, unit.encode(), on_delivery=lambda error, _: failed.append(error))
             self.producer.poll(0)
-        left = self.producer.flush(FLUSH_SECONDS)
-        failed, self.failed = self.failed, []
-        if left or failed:
-            raise ConnectionError(failed[0] if failed else f"{left} messages are not acknowledged")
-
-    def _delivered(self, error: Any, message: Any) -> None:
-        if error is not None:
-            self.failed.append(str(error))
+        left = self.producer.flush(ANSWER_SECONDS)
+        errors = [str(error) for error in failed if error is not None]
+        if left or errors:
+            raise ConnectionError(errors[0] if errors else f"{left} messages are not acknowledged")

@@ -65,8 +65,6 @@ METRIC = (
     "string string_value 15"
 )
 """Fields of a metric, with one value at most. Those that are left out are data sets, templates and properties."""
-SIGNED = {1: 8, 2: 16, 3: 32, 4: 64}
-"""Bits of the signed types of data, which are sent as unsigned numbers."""
 REBIRTH = b"\x12\x1a\n\x14Node Control/Rebirth \x0bp\x01"
 """The payload of a command to a node: declare your metrics again."""
 
@@ -108,6 +106,8 @@ class Sparkplug:
 
     def decode(self, topic: str, payload: bytes) -> Samples | None:
         """The samples of a message; None if it has none. ValueError if it cannot be read."""
+        from google.protobuf.message import DecodeError
+
         kind, group, node, device = parts_of(topic)
         if kind not in (*BIRTHS, *DATA):
             return None
@@ -116,7 +116,10 @@ class Sparkplug:
         where = "/".join(filter(None, (PREFIX, group, node, device)))
         names = self._names.get((group, node), {})
         born = kind in BIRTHS
-        read = _read(payload)
+        try:
+            read = _message().FromString(payload)
+        except DecodeError as error:
+            raise ValueError(f"not a message of Sparkplug: {error}") from None
         if kind == "NBIRTH":
             names = {}
         names = names | {
@@ -133,11 +136,15 @@ class Sparkplug:
                 last[name] = value_of(one)
         if len(last) > MESSAGE_FIELDS or (len(self._last) >= KNOWN_NODES and where not in self._last):
             raise ValueError(f"more than {MESSAGE_FIELDS} metrics, or {KNOWN_NODES} nodes and devices.")
-        before = {} if born else self._last.get(where, {})
+        known = {} if born else dict(self._last.get(where, {}))
         if born:
             self._names[group, node] = names
         self._last[where] = last
-        return _samples(where, rows, before) if rows else None
+        filled = []  # a sample for each time, with the values of before where it has none
+        for when in sorted(rows):
+            known |= rows[when]
+            filled.append(known | {"timestamp": when})
+        return of_rows(where, filled[: bounded(len(filled))]) if rows else None
 
 
 def parts_of(topic: str) -> tuple[str, str, str, str]:
@@ -154,34 +161,14 @@ def rebirth_topic(topic: str) -> str:
     return f"{PREFIX}/{group}/NCMD/{node}"
 
 
-def _samples(topic: str, rows: dict[int, dict[str, Any]], before: dict[str, Any]) -> Samples:
-    """A sample for each time, with the values of before where it has none."""
-    known, filled = dict(before), []
-    for when in sorted(rows):
-        known |= rows[when]
-        filled.append(known | {"timestamp": when})
-    bounded(len(filled))
-    return of_rows(topic, filled)
-
-
 def value_of(metric: Any) -> Any:
     """The value of a metric as a number or text; None if it is null or of another type."""
     kind = metric.WhichOneof("value")
     if metric.is_null or kind is None:
         return None
-    value, bits = getattr(metric, kind), SIGNED.get(metric.datatype, 0)
-    half = 1 << bits >> 1
+    value, signed = getattr(metric, kind), metric.datatype in (1, 2, 3, 4)  # of 8 to 64 bits, sent as unsigned numbers
+    half = 1 << (4 << metric.datatype) - 1 if signed else 0
     return (value + half) % (2 * half) - half if half and kind in ("int_value", "long_value") else value
-
-
-def _read(payload: bytes) -> Any:
-    """A payload of Sparkplug."""
-    from google.protobuf.message import DecodeError
-
-    try:
-        return _message().FromString(payload)
-    except DecodeError as error:
-        raise ValueError(f"not a message of Sparkplug: {error}") from None
 
 
 CLOSE_SECONDS = 1.0

@@ -170,17 +170,15 @@ class _Writer(Writer):
             for name, value in _values(one, batch.about[one.unit]["names"]):
                 variable = self.variables.get((one.unit, name))
                 if variable is None:
-                    folder = await self._folder(one.unit)
-                    variable = await folder.add_variable(f"ns={self.space};s={one.unit}.{name}", name, value)
+                    if one.unit not in self.folders:
+                        home = self.server.nodes.objects
+                        self.folders[one.unit] = await home.add_folder(f"ns={self.space};s={one.unit}", one.unit)
+                    variable = await self.folders[one.unit].add_variable(
+                        f"ns={self.space};s={one.unit}.{name}", name, value
+                    )
                     self.variables[one.unit, name] = variable
                 else:
                     await variable.write_value(value)
-
-    async def _folder(self, unit: str) -> Any:
-        if unit not in self.folders:
-            home = self.server.nodes.objects
-            self.folders[unit] = await home.add_folder(f"ns={self.space};s={unit}", unit)
-        return self.folders[unit]
 
     def close(self) -> None:
         try:

@@ -171,12 +171,6 @@ def _moment(time: float | None, number: int) -> datetime:
         return datetime.fromtimestamp(0, UTC)
 
 
-TYPES: dict[str, Any] = {
-    "number": pl.Int64, "unit": pl.String, "time": pl.Float64, "y": pl.Float64, "y_hat": pl.Float64, "e": pl.Float64,
-    "s": pl.Float64, "ok": pl.Boolean, "theta": pl.List(pl.Float64), "std": pl.List(pl.Float64), "alarm": pl.Boolean,
-}  # fmt: skip
-
-
 @dataclass(frozen=True)
 class ParquetSink(Sink):
     """A folder of files."""
@@ -210,6 +204,5 @@ class _ParquetWriter(Writer):
 def _table(batch: Outcome, part: Results) -> pl.DataFrame:
     columns = {name: part.values[:, k] for k, name in enumerate(("time", "y", "y_hat", "e", "s"))}
     given = {"number": part.number, "unit": [batch.names[k] for k in part.unit.tolist()], **columns}
-    given |= {"ok": (part.flags & OK) > 0, "alarm": (part.flags & ALARM) > 0}
-    given |= {"theta": part.theta.tolist(), "std": part.std.tolist()}
-    return pl.DataFrame(given, schema_overrides=TYPES).with_columns(pl.col("time").fill_nan(None)).select(*TYPES)
+    given |= {"ok": (part.flags & OK) > 0, "theta": part.theta.tolist(), "std": part.std.tolist()}
+    return pl.DataFrame(given | {"alarm": (part.flags & ALARM) > 0}).with_columns(pl.col("time").fill_nan(None))

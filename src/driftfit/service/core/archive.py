@@ -58,7 +58,7 @@ class Archive:
 
     def begin(self, pending: Pending, journal: Journal, sinks_at: int) -> None:
         """Look for old rows; results that no sink has written yet are not deleted without an event."""
-        now, needed = time.time(), journal.first_needed()
+        now, needed = time.time(), journal.number("needed from")
         query = "select count(*) from result where at < ? and first > ?"
         ((lost,),) = journal.db.execute(query, (now - DAY_SECONDS * self.options.results, sinks_at))
         if lost:

@@ -25,7 +25,7 @@ import numpy as np
 from driftfit.service.config import Config
 from driftfit.service.connect.base import Batch
 from driftfit.service.core.archive import Archive
-from driftfit.service.core.journal import DAMAGED, NEEDED_FROM, Act, Group, Item, Journal, Pending, check_storable
+from driftfit.service.core.journal import DAMAGED, Act, Group, Item, Journal, Pending, check_storable
 from driftfit.service.core.unit import Out, Unit, rules_of
 from driftfit.service.core.units import Units
 
@@ -71,7 +71,7 @@ class Engine:
         self._stepped = time.monotonic()
         self.last_stored = 0
         """The last group whose results were stored by this process."""
-        self.next, self._head = self.journal.next_number(), self.journal.head()
+        self.next, self._head = self.journal.number("next"), self.journal.head()
         self._fresh: deque[Group] = deque()
         """The newest results, so that sinks need not wait until these are stored."""
         self._elsewhere = self.next - 1
@@ -89,8 +89,8 @@ class Engine:
 
     def _recover(self) -> int:
         """Bring all states to the end of the log; the number of samples that were processed again."""
-        unstored, again = self.journal.first_without_results(), 0
-        for first, items in self.journal.groups(self.journal.first_needed()):
+        unstored, again = self.journal.number("results from"), 0
+        for first, items in self.journal.groups(self.journal.number("needed from")):
             out, number = Out(), first
             for item in items:
                 again += self._apply(number, item, out, replay=True)
@@ -211,17 +211,10 @@ class Engine:
                 self.tell("", "source", {"source": source, "noticed": batch.noticed})
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
-        messages = (
-            (batch.client or source, samples, batch.receipt)
-            for source, batch in arrived.batches
-            for samples in batch.samples
-        )
-        items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
-        for action in arrived.actions:
-            unit = self.units.names.get(action.unit)
-            if unit is not None:
-                items.append(Act(unit, action.what))
-        return items
+        messages = ((one.client or source, samples, one.receipt) for source, one in arrived.batches
+                    for samples in one.samples)  # fmt: skip
+        admitted, names = self.units.admitted(messages, self._pending, self.next), self.units.names
+        return [*admitted, *(Act(names[one.unit], one.what) for one in arrived.actions if one.unit in names)]
 
     def _process(self, first: int, items: list[Item], now: float) -> dict[int, str]:
         """Update the units of a group; its results become part of the next transaction.
@@ -241,7 +234,12 @@ class Engine:
         group = Group(first, out.results, out.events, now)
         self._pending.add_results(group)
         self._pending.blocks += out.blocks
-        self._publish(group)
+        if group.parts or group.events:
+            with self.news:  # sinks may see results that are not stored yet: what they follow from is in the journal
+                self._fresh.append(group)
+                while len(self._fresh) > KEPT_GROUPS:
+                    self._elsewhere = self._fresh.popleft().first
+                self.news.notify_all()
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
         self.samples += sum(len(one.number) for one in out.results)
@@ -251,16 +249,6 @@ class Engine:
             name = self.units.get(unit).name if unit else ""
             log.log(logging.ERROR if bad else logging.INFO, kind, extra={"unit": name, "detail": detail})
         return {number: detail["refused"] for number, *_, detail in out.events if "refused" in detail}
-
-    def _publish(self, group: Group) -> None:
-        """Let sinks see results. They are not stored yet, but what they follow from is in the journal."""
-        if not group.parts and not group.events:
-            return
-        with self.news:
-            self._fresh.append(group)
-            while len(self._fresh) > KEPT_GROUPS:
-                self._elsewhere = self._fresh.popleft().first
-            self.news.notify_all()
 
     def after(self, group: int, stored: Journal) -> list[Group]:
         """The results after a group, some of them if there are many."""
@@ -301,6 +289,8 @@ class Engine:
     def _store_states(self, everything: bool = False) -> None:
         """Add the states that have been waiting longest to the next transaction."""
         begin, now = time.perf_counter(), time.monotonic()
+        # states contain every sample that was processed, which is all before the present group
+        upto = self._pending.log[0] if self._pending.log is not None else self.next
         if self._dirty:
             self.units.note_programs(self._pending)
         while self._dirty and (everything or time.perf_counter() - begin < STORE_SECONDS):
@@ -309,14 +299,11 @@ class Engine:
                 break
             del self._dirty[number]
             unit = self.units.get(number)
-            # the state contains every sample that was processed, which is all before the present group
-            upto = self._pending.log[0] if self._pending.log is not None else self.next
             self._pending.snapshots.append((number, upto, unit.state()))
             self._pending.blocks += self.units.sections[unit.streams.index].blocks.flush(unit.place, number)
-        upto = self._pending.log[0] if self._pending.log is not None else self.next
         needed = next(iter(self._dirty.values()))[0] if self._dirty else upto
         if self._pending:
-            self._pending.meta[NEEDED_FROM] = str(needed)
+            self._pending.meta["needed from"] = str(needed)
 
     def _commit(self) -> bool:
         """Write the next transaction; wait while that is impossible. False if the service was stopped meanwhile."""
@@ -331,14 +318,13 @@ class Engine:
         while True:
             try:
                 self._pending.commit(self.journal.db)
+                break
             except sqlite3.Error as error:
                 if not self.problem:
                     log.error("journal", extra={"detail": str(error)})
                 self.problem = f"the journal cannot be written: {error}; sources are held back."
                 if self._stop.wait(RETRY_SECONDS):
                     return False
-                continue
-            break
         self.problem = ""
         self.positions |= self._pending.positions
         self.last_stored = max([self.last_stored, *(first for first, *_ in self._pending.results)])

@@ -32,7 +32,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -66,8 +66,6 @@ log = logging.getLogger("driftfit.service")
 PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
 FORMAT = "3"
 REMEDY = "driftfit serve FILE --rebuild computes the states again from the journal"
-RESULTS_FROM, NEEDED_FROM, HEAD = "results from", "needed from", "head"
-"""Keys of ``meta``: of `Journal.first_without_results`, `Journal.first_needed` and `Journal.head`."""
 NAME = "driftfit.db"
 
 
@@ -166,7 +164,8 @@ class Journal:
         self.path.chmod(0o600)
         for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
-        row = self.db.execute("select value from meta where key = 'format'").fetchone() if self._has("meta") else None
+        old = self.db.execute("select 1 from sqlite_master where name = 'meta'").fetchone()
+        row = self.db.execute("select value from meta where key = 'format'").fetchone() if old else None
         if row not in (None, (FORMAT,)):
             raise ValueError(
                 f"{self.path} has the format {row[0]}, and this version reads {FORMAT}: use another folder, or the "
@@ -178,9 +177,6 @@ class Journal:
         if rebuild:
             self._forget_states()
 
-    def _has(self, table: str) -> bool:
-        return self.db.execute("select 1 from sqlite_master where name = ?", (table,)).fetchone() is not None
-
     def _put(self, table: str, row: Sequence[Any]) -> None:
         self.db.execute(f"insert or replace into {table} values ({'?, ' * len(row)}?)", (*row, sum_of(*row)))
 
@@ -190,7 +186,7 @@ class Journal:
         self.db.execute("begin immediate")
         for table in ("snapshot", "program"):
             self.db.execute(f"delete from {table}")
-        self._put("meta", (NEEDED_FROM, str(oldest)))
+        self._put("meta", ("needed from", str(oldest)))
         self.db.execute("commit")
 
     def close(self) -> None:
@@ -214,20 +210,15 @@ class Journal:
         rows = self.certain("meta", "where key = ?", key)
         return str(rows[0][1]) if rows else None
 
-    def next_number(self) -> int:
-        return int(self.meta("next") or 1)
-
     def head(self) -> bytes:
         """The last digest of the chain; empty without one."""
-        return bytes.fromhex(self.meta(HEAD) or "")
+        return bytes.fromhex(self.meta("head") or "")
 
-    def first_without_results(self) -> int:
-        """The first group whose results are not yet stored."""
-        return int(self.meta(RESULTS_FROM) or 1)
-
-    def first_needed(self) -> int:
-        """The number from which the log is needed, because some state is not stored after it."""
-        return int(self.meta(NEEDED_FROM) or 1)
+    def number(self, key: Literal["next", "results from", "needed from"]) -> int:
+        """The number of the next sample, of the first group whose results are not yet stored, or that from which the
+        log is needed because some state is not stored after it.
+        """
+        return int(self.meta(key) or 1)
 
     def positions(self) -> dict[str, Any]:
         return {name: msgspec.json.decode(value) for name, value in self.certain("position")}
@@ -254,18 +245,6 @@ class Journal:
         """(number up to which samples are in it, the stored state)."""
         row = self.db.execute("select * from snapshot where unit = ?", (unit,)).fetchone()
         return None if row is None else (int(row[1]), bytes(row[2]) if sound("snapshot", row) else b"")
-
-    def rows_of(self, unit: int) -> tuple[list[float], list[list[float]]]:
-        """All samples of a unit that the log has, in the order of their arrival."""
-        times: list[float] = []
-        rows: list[list[float]] = []
-        for _, items in self.groups(1):
-            for item in items:
-                if isinstance(item, Rows):
-                    own = item.some(np.flatnonzero(item.unit == unit))
-                    times += [] if own.time is None else own.time.tolist()
-                    rows += own.values.tolist()
-        return times, rows
 
     def evicted(self) -> set[int]:
         """Numbers of the units that are known by their rows only."""
@@ -306,7 +285,7 @@ class Pending:
         assert self.log is not None
         digest = linked(before, self.log)
         self.chain.append((self.log[0], before, digest))
-        self.meta[HEAD] = digest.hex()
+        self.meta["head"] = digest.hex()
         return digest
 
     def add_results(self, group: Group) -> None:
@@ -316,7 +295,7 @@ class Pending:
             count = sum(len(one.number) for one in parts)
             self.results.append((first, count, at, _encode(([one.plain() for one in parts], events))))
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
-        self.meta[RESULTS_FROM] = str(first + 1)
+        self.meta["results from"] = str(first + 1)
 
     def add_event(self, number: int, unit: int, at: float, kind: str, detail: dict[str, Any]) -> None:
         """An event that no sample caused, of a unit or, with 0, of none."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time as wall
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,11 +35,11 @@ REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time
 """How samples are counted that do not enter the journal."""
 
 
-CounterOf = Callable[[int], Counter[str] | None]
-"""Who, besides the unit, counts sample k if it is left out."""
+Counters = Sequence[Counter[str] | None]
+"""Who count what is left out; for samples, who counts each of them besides its unit."""
 
 
-def tally(counters: Sequence[Counter[str] | None], reason: str, count: int) -> None:
+def tally(counters: Counters, reason: str, count: int) -> None:
     """Count samples that are left out, by all of these counters."""
     for one in counters:
         if one is not None:
@@ -81,26 +81,26 @@ class Section:
             values = np.zeros((count, len(self.streams.settings.columns)))
             trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
-    def admit(self, places: Array, time: Array | None, values: Array, counter_of: CounterOf) -> Rows | None:
+    def admit(self, places: Array, time: Array | None, values: Array, counters: Counters) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
         if time is None:
             order = np.argsort(places, kind="stable")
         else:
             far = time > np.fmax(self.streams.newest[places], wall.time()) + self.streams.settings.ahead
-            self._refuse("time in the future", places, np.flatnonzero(far), counter_of)
+            self._refuse("time in the future", places, np.flatnonzero(far), counters)
             kept = np.flatnonzero(~far)
             order, fate = self.streams.waiting.judge(places[kept], time[kept], self.streams.newest)
             order = kept[order]
             for code, name in REFUSED.items():
-                self._refuse(name, places, kept[fate == code], counter_of)
+                self._refuse(name, places, kept[fate == code], counters)
         if not len(order):
             return None
         time = None if time is None else time[order]
         return Rows(self.streams.index, self.streams.numbers[places[order]], time, values[order])
 
-    def _refuse(self, name: str, places: Array, which: Array, counter_of: CounterOf) -> None:
+    def _refuse(self, name: str, places: Array, which: Array, counters: Counters) -> None:
         for k in which.tolist():
-            tally((self.units[places[k]].rare, counter_of(k)), name, 1)
+            tally((self.units[places[k]].rare, counters[k]), name, 1)
 
     def process(self, first: int, rows: Rows, out: Out, done: Array | None = None) -> None:
         """Process samples of the journal, the first of which has the number ``first``.
@@ -143,14 +143,8 @@ class Section:
         collected = any(alarm.rule.kind == "glr" for k in own.tolist() for alarm in self.units[k].alarms)
         records = Records(tuple(own.tolist()), first, length, values[:, 0], values[:, 1:], Known(known), time)
         try:
-            found = advance(
-                [self.streams.program] * len(own),
-                records,
-                self.streams.words[own],
-                self.streams.begun[own],
-                1,
-                collected,
-            )
+            programs, words = [self.streams.program] * len(own), self.streams.words[own]
+            found = advance(programs, records, words, self.streams.begun[own], 1, collected)
         except Exception as error:  # whatever it is, the other units continue
             if len(own) == 1:
                 self.units[own[0]].fail(int(number[0]), error, out)
@@ -161,8 +155,12 @@ class Section:
             return
         refused = self._refused_before(own)
         self.streams.words[own], self.streams.begun[own] = found.states(), True
-        if self.streams.program.gate is not None:
-            self._count_refused(found, places, own, self._refused_before(own) - refused)
+        if self.streams.program.gate is not None:  # what gates left out, of the samples and of the first ones of units
+            reason, first_refused = found.reasons(), self._refused_before(own) - refused
+            for k in np.flatnonzero((reason != gate.USED) & (reason % gate.SIGNAL != gate.AT_START)).tolist():
+                self._count(places[k], reason.item(k), 1)
+            for k in np.flatnonzero(first_refused > 0).tolist():
+                self._count(own[k], gate.AT_START, first_refused.item(k))
         if time is not None:
             self.streams.last[own] = time[first + length - 1]
         self._tell(found, Rows(self.streams.index, places, time, values), known[:, NOISE], number, out)
@@ -173,14 +171,6 @@ class Section:
             return np.zeros(len(own), int)
         words = self.streams.program.layout.field(self.streams.words[own], "gate_refused")[:, 0]
         return np.where(self.streams.begun[own], words, 0)
-
-    def _count_refused(self, found: Advanced, places: Array, own: Array, first: Array) -> None:
-        """Count what gates left out, by reason: samples at ``places`` (N,), and ``first`` samples of units (K,)."""
-        reason = found.reasons()
-        for k in np.flatnonzero((reason != gate.USED) & (reason % gate.SIGNAL != gate.AT_START)).tolist():
-            self._count(places[k], reason.item(k), 1)
-        for k in np.flatnonzero(first > 0).tolist():
-            self._count(own[k], gate.AT_START, first.item(k))
 
     def _count(self, place: int, code: int, count: int) -> None:
         tally((self.units[place].rare, self.left_out), SAID[code % gate.SIGNAL][0].lower(), count)

@@ -166,20 +166,15 @@ class Unit:
             raise ValueError(f"there is no action {what!r}.")
 
     def plain(self) -> dict[str, Any]:
-        """The facts that the page shows besides the results."""
+        """The facts that the page shows besides the results, of a `Bank` the present probabilities of its events."""
+        weighs = self.streams.program.tracker.weighs and not self.failure
+        now = self.live.hypotheses if weighs else None
         return {
             "counts": dict(self.counts), "failure": self.failure, "acknowledged": self.acknowledged,
             "unarmed": self.unarmed, "held": bool(self.streams.held[self.place]), "waiting": self.waiting,
             "limits": {name: [None if math.isinf(v) else v for v in pair] for name, pair in self.limits.items()},
-            "hypotheses": self._hypotheses(),
+            "hypotheses": None if now is None else dict(zip(now.names, now.lag_prob[0].tolist(), strict=False)),
         }  # fmt: skip
-
-    def _hypotheses(self) -> dict[str, float] | None:
-        """Present probabilities of the events of a `Bank`; None for other trackers."""
-        if self.failure or not self.streams.program.tracker.weighs:
-            return None
-        now = self.live.hypotheses
-        return dict(zip(now.names, now.lag_prob[0].tolist(), strict=False))
 
     def state(self) -> bytes:
         alarms = [alarm.plain() for alarm in self.alarms]
@@ -264,7 +259,14 @@ class Streams:
         place = self.free.pop() if self.free else self.count
         self.count = max(self.count, place + 1)
         if place == self.capacity:
-            self._grow(max(8, 2 * place))
+            capacity = max(8, 2 * place)
+            for name in ("words", "begun", "last", "newest", "held", "limits", "counted", "numbers"):
+                old = getattr(self, name)
+                new = np.zeros((capacity, *old.shape[1:]), old.dtype)
+                if name in ("last", "newest"):
+                    new[...] = math.nan
+                new[: len(old)] = old
+                setattr(self, name, new)
         if number >= len(self._places):
             more = max(number + 1, 2 * len(self._places)) - len(self._places)
             self._places = np.concatenate([self._places, np.full(more, -1)])
@@ -277,15 +279,6 @@ class Streams:
         self.clear(place)
         self.counted[place], self._places[self.numbers[place]] = 0, -1
         self.free.append(place)
-
-    def _grow(self, capacity: int) -> None:
-        for name in ("words", "begun", "last", "newest", "held", "limits", "counted", "numbers"):
-            old = getattr(self, name)
-            new = np.zeros((capacity, *old.shape[1:]), old.dtype)
-            if name in ("last", "newest"):
-                new[...] = math.nan
-            new[: len(old)] = old
-            setattr(self, name, new)
 
     def places(self, numbers: Array) -> Array:
         """Places of units by their numbers; -1 for those that are not there."""
@@ -368,8 +361,7 @@ def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
         return {"do": "calibrated", "rules": [], "refused": dict.fromkeys(alarm.on, str(error))}
     for kind in alarm.on:
         try:
-            alarms = run.detect(kind, every=alarm.each, reference=len(rows))
-            rules.append(describe(alarms.rule))
+            rules.append(describe(run.detect(kind, every=alarm.each, reference=len(rows)).rule))
         except Exception as error:
             refused[kind] = str(error)
     return {"do": "calibrated", "rules": rules, "on": list(alarm.on), "refused": refused, "samples": len(rows)}

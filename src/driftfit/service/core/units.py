@@ -15,9 +15,9 @@ from driftfit.engine.kernel import Array
 from driftfit.service.config import UnitSettings
 from driftfit.service.connect.base import NO_SIGNAL, TOO_MANY_NEW, Receipt, Samples, numbers_of, seconds_of
 from driftfit.service.core.journal import Journal, Pending, Rows
-from driftfit.service.core.section import CounterOf, Section, tally
+from driftfit.service.core.section import Section, tally
 from driftfit.service.core.unit import SAMPLES, Unit
-from driftfit.service.options import ServiceOptions, valid_name
+from driftfit.service.options import NAME_CHARACTERS, ServiceOptions
 
 log = logging.getLogger("driftfit.service")
 Message = tuple[str, Samples, Receipt | None]
@@ -76,11 +76,6 @@ def _extend(column: list[Any], cells: Any, count: int) -> None:
         column += [cells] * count
 
 
-def _counter_of(one: Gathered, messages: Array) -> CounterOf:
-    """Who counts sample k, which came in one of the messages."""
-    return lambda k: one.counters[messages[k]]
-
-
 class Units:
     """All units, by number and by topic."""
 
@@ -135,33 +130,27 @@ class Units:
 
     def get(self, unit: int) -> Unit:
         """A unit by number, with the state that the database has of it."""
-        found = self._units.get(unit)
-        if found is None:
-            name, section = self._known[unit]
-            found = self._units[unit] = self.sections[section].add(unit, name)
-            self._restore(found)
-            if found.failure.startswith(UNREADABLE):
+        if unit not in self._units:
+            self._units[unit] = self._read(unit, self.sections[self._known[unit][1]])
+            if self._units[unit].failure.startswith(UNREADABLE):
                 self.unreadable.append(unit)
-        return found
+        return self._units[unit]
 
     def seen(self, unit: int) -> Unit:
         """A unit for another thread to look at: one that is not in memory is read from the database by itself."""
-        found = self._units.get(unit)
-        if found is None:
-            name, section = self._known[unit]
-            found = Section(section, self.settings[section]).add(unit, name)
-            self._restore(found)
-        return found
+        section = self._known[unit][1]
+        return self._units.get(unit) or self._read(unit, Section(section, self.settings[section]))
 
-    def _restore(self, unit: Unit) -> None:
-        """Bring a unit to the state that the database has of it."""
-        stored = self.journal.state(unit.number)
+    def _read(self, unit: int, section: Section) -> Unit:
+        """A new unit of a section, in the state that the database has of it."""
+        found, stored = section.add(unit, self._known[unit][0]), self.journal.state(unit)
         if stored is not None:
-            self.since[unit.number] = stored[0]
+            self.since[unit] = stored[0]
             try:
-                unit.restore(stored[1], self._programs)
+                found.restore(stored[1], self._programs)
             except Exception as error:  # a state that cannot be read stops its unit, not the others
-                unit.failure = f"{UNREADABLE}: {error}"[:500]
+                found.failure = f"{UNREADABLE}: {error}"[:500]
+        return found
 
     def note_trouble(self, units: Iterable[int], pending: Pending) -> None:
         """Add to the next transaction what does not work in units, where that has changed."""
@@ -186,26 +175,8 @@ class Units:
 
     def of_topic(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
         """(the units of a topic, why there may be more later); new ones are made."""
-        route, why = self._routes.get(topic), ""
-        if route is None:
-            route, why = self._route(topic, client, pending, born)
-            if not why:
-                self._routes[topic] = route
-            if len(self._routes) > KNOWN_TOPICS:
-                self._routes.popitem(last=False)
-        return route, why
-
-    def named(self, topic: str) -> list[tuple[int, str]]:
-        """(section, name) of the units to which a topic belongs."""
-        found = []
-        for section, settings in enumerate(self.settings if valid_name(topic) else ()):
-            name = settings.match.unit(topic)
-            if name is not None:
-                alone = settings.match.name or len(self.settings) == 1
-                found.append((section, name if alone else f"{name}:{settings.y}"))
-        return found
-
-    def _route(self, topic: str, client: str, pending: Pending, born: int) -> tuple[tuple[Unit, ...], str]:
+        if topic in self._routes:
+            return self._routes[topic], ""
         found, why = [], ""
         for section, name in self.named(topic):
             unit = self.names.get(name)
@@ -218,7 +189,21 @@ class Units:
                 self.refused["two sections give one name"] += 1
                 continue
             found.append(self.get(unit))
+        if not why:
+            self._routes[topic] = tuple(found)
+        if len(self._routes) > KNOWN_TOPICS:
+            self._routes.popitem(last=False)
         return tuple(found), why
+
+    def named(self, topic: str) -> list[tuple[int, str]]:
+        """(section, name) of the units to which a topic belongs."""
+        found, valid = [], 0 < len(topic) <= NAME_CHARACTERS and topic.isprintable()
+        for section, settings in enumerate(self.settings if valid else ()):
+            name = settings.match.unit(topic)
+            if name is not None:
+                alone = settings.match.name or len(self.settings) == 1
+                found.append((section, name if alone else f"{name}:{settings.y}"))
+        return found
 
     def _refusal(self, name: str, client: str) -> str:
         """Why a client may not make a unit now."""
@@ -307,7 +292,8 @@ class Units:
                 which = np.repeat(np.arange(len(one.places)), one.lengths)
                 paid = np.flatnonzero(self._paid(section, one)[which])
                 times = None if times is None else times[paid]
-                found.append(section.admit(places[paid], times, values[paid], _counter_of(one, which[paid])))
+                counters = [one.counters[k] for k in which[paid].tolist()]
+                found.append(section.admit(places[paid], times, values[paid], counters))
         return [rows for rows in found if rows is not None]
 
     def _paid(self, section: Section, one: Gathered) -> Array:

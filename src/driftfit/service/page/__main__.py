@@ -62,13 +62,8 @@ class Connection(H11Protocol):
         sent = self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body
         return not sent and not self.transport.is_closing()
 
-    @property
-    def uploads(self) -> bool:
-        """Whether the body of a request is on its way."""
-        return self.cycle is not None and not self.cycle.response_complete
-
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """End the one that has waited longest where there are too many."""
+        """End the one that has waited longest where there are too many; those with a body on its way end last."""
         super().connection_made(transport)
         self.since = self.loop.time()
         self.loop.call_later(WAIT_SECONDS, self._look)
@@ -76,7 +71,8 @@ class Connection(H11Protocol):
         own = [one for one in every if one.client and self.client and one.client[0] == self.client[0]]
         for most, found in ((WAITING_OF_CLIENT, own), (WAITING_OF_ALL, every)):
             if len(found) > most:
-                min(found, key=lambda one: (one.uploads, one.since)).transport.abort()
+                longest = min(found, key=lambda one: (bool(one.cycle and not one.cycle.response_complete), one.since))
+                longest.transport.abort()
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""

@@ -112,7 +112,8 @@ class Access:
         if not self.rates.allows(client):
             return 429, "too many requests"
         host = headers.get("host", "")
-        if not self.any_host and _without_port(host) not in self.hosts:
+        name, colon, port = host.rpartition(":")
+        if not self.any_host and (name if colon and port.isdigit() else host).lower() not in self.hosts:
             return 421, "unknown host; add it to names = [...] in [page]"
         changes = scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD", "OPTIONS")
         origin = headers.get("origin")
@@ -167,11 +168,6 @@ class Access:
         headers: dict[str, Any] = {"location": "/login"} if wants_page else {}
         response = JSONResponse({"error": reason}, 303 if wants_page else status, headers)
         await response(scope, receive, send)
-
-
-def _without_port(host: str) -> str:
-    name, colon, port = host.rpartition(":")
-    return name.lower() if colon and port.isdigit() else host.lower()
 
 
 SCRYPT_N, SCRYPT_R, SCRYPT_P = 1 << 14, 8, 1

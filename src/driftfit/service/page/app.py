@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +33,6 @@ from driftfit.service.control import health
 from driftfit.service.options import PageOptions
 from driftfit.service.page.access import COOKIE, SESSION_SECONDS, Access, Rates, Sessions, password_fits
 from driftfit.service.page.feed import (
-    METRICS_TYPE,
     Feed,
     column_names,
     columns_of,
@@ -163,10 +163,8 @@ class Page:
             *(Route(one.path, getattr(self, one.name), methods=[one.method.upper()]) for one in OPERATIONS),
             Route("/api/openapi.json", lambda request: JSONResponse(description())),
         ]
-        pages: list[BaseRoute] = [
-            Route(path, self.file(name))
-            for path, name in (("/", "index.html"), ("/login", "login.html"), ("/api", "api.html"))
-        ]
+        files = {"/": "index.html", "/login": "login.html", "/api": "api.html"}
+        pages: list[BaseRoute] = [Route(path, self.file(name)) for path, name in files.items()]
         others: list[BaseRoute] = [
             WebSocketRoute("/ws", self.sockets.endpoint),
             Mount("/static", StaticFiles(directory=STATIC)),
@@ -207,19 +205,14 @@ class Page:
         search = request.query_params.get("search", "").lower()[:200]
         if not search:
             return Answer({"units": self.feed.fleet, "count": len(self.feed.names.names)})
-        feed, found, now = self.feed, [], time.time()
-        for name in feed.names.about:
-            if search in name.lower():
-                found.append(feed.shown(name, now) | {"age": None})
-            if len(found) == 200:
-                break
+        matching, now = (name for name in self.feed.names.about if search in name.lower()), time.time()
+        found = [self.feed.shown(name, now) | {"age": None} for name in islice(matching, 200)]
         return Answer({"units": found, "count": len(found)})
 
     async def unit(self, request: Request) -> Response:
         name = request.path_params["unit"]
         number = self.number(name)
-        row = self.feed.latest.get(number)
-        about = self.feed.names.about[name]
+        row, about = self.feed.latest.get(number), self.feed.names.about[name]
         try:
             state = await self.feed.ask({"do": "unit", "unit": name})
         except OSError:
@@ -373,7 +366,8 @@ class Page:
         return response
 
     async def metrics(self, request: Request) -> Response:
-        return PlainTextResponse(metrics_of(self.feed, self.sockets.count), media_type=METRICS_TYPE)
+        media = "text/plain; version=0.0.4; charset=utf-8"
+        return PlainTextResponse(metrics_of(self.feed, self.sockets.count), media_type=media)
 
     async def healthz(self, request: Request) -> Response:
         return JSONResponse(*health(self.feed.status, self.feed.alive, request.scope["user"] is not None))

@@ -100,10 +100,8 @@ class Feed:
             for unit in self.journal.evicted() & self.latest.keys():
                 del self.latest[unit], self.updated[unit]
                 self._base.pop(unit, None)
-        for unit in [
-            unit for unit, (_, asked) in self.watched.items() if time.monotonic() - asked[0] > WATCHED_SECONDS
-        ]:
-            del self.watched[unit]
+        since = time.monotonic() - WATCHED_SECONDS
+        self.watched = {unit: one for unit, one in self.watched.items() if one[1][0] >= since}
 
     def drift(self, unit: int, row: Result) -> float:
         """The largest change of a parameter in the last minutes, in standard deviations."""
@@ -290,9 +288,6 @@ def _as_lists(found: list[tuple[Array, int]]) -> dict[str, Any]:
     kinds = ("low", "high", "mean")
     columns = {kind: np.stack([one[k] for one, _ in found]).T.tolist() if found else [] for k, kind in enumerate(kinds)}
     return {"count": sum(count for _, count in found), **columns}
-
-
-METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
 def metrics_of(feed: Feed, viewers: int) -> str:

@@ -121,10 +121,6 @@ class Law(Settings):
         """
         return cls("cycle", period=period, time=time, std=std)
 
-    def moving_level(self) -> float | None:
-        """The variance that the level gains in a nominal sample; None if the law says nothing of it."""
-        return {"walk": self.q, "trend": self.level, "returns": 0.0}.get(self.kind)
-
     def components(self, i: int) -> list[tuple[float, ...]]:
         """Columns of the table for what the law adds to the level of parameter i."""
         damping = 0.0 if self.time is None else 1.0 / self.time
@@ -163,13 +159,12 @@ def table_of(owner: str, laws: tuple[tuple[str, Law], ...], names: tuple[str, ..
     columns: list[tuple[float, ...]] = []
     for i, name in enumerate(names):
         own = [law for owner_of_law, law in laws if owner_of_law == name]
-        levels = [law for law in own if law.kind in ("walk", "trend")] or [law for law in own if law.kind == "returns"][
-            :1
-        ]
+        levels = [law for law in own if law.kind in ("walk", "trend")]
         if len(levels) > 1:
             raise ValueError(f"{owner}: two laws of {name!r} move its level; give one of walk and trend.")
-        noise = levels[0].moving_level() if levels else q[i]
+        returns = any(law.kind == "returns" for law in own)  # to a constant level
         trend = bool(levels) and levels[0].kind == "trend"
+        noise = (levels[0].level if trend else levels[0].q) if levels else 0.0 if returns else q[i]
         columns.append((i, 1.0, LEVEL if trend else PLAIN, 0.0, 0.0, noise or 0.0))
         columns += [(i, 0.0, SLOPE, 0.0, 0.0, levels[0].q or 0.0)] if trend else []
         columns += [column for law in own for column in law.components(i)]
