@@ -5,6 +5,9 @@ import pytest
 
 from driftfit import (
     ARX,
+    RLS,
+    AdaptiveKalman,
+    Bank,
     DataWarning,
     Gate,
     Kalman,
@@ -169,6 +172,78 @@ def test_candidates_on_line_take_the_decisions_of_one_reference():
     np.testing.assert_array_equal(one.weights, two.weights)
     again = LiveSelection.from_bytes(one.to_bytes())
     assert again.reference.left_out.counts == {"Left out": 1}
+
+
+def rows(T=200):
+    """y (T, 2) and u (T, 2, 2) of two sensors of one theta, with codes and with gaps for them."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((T, 2, 2))
+    y = u @ [1.0, 2.0] + 0.01 * rng.standard_normal((T, 2))
+    codes, strange, gaps, unknown = y.copy(), u.copy(), y.copy(), u.copy()
+    codes[[3, 100, 101], [0, 1, 1]], strange[[6, 150], [1, 0], [0, 1]] = 9999.0, -999.0
+    gaps[codes == 9999.0], unknown[strange == -999.0] = np.nan, np.nan
+    return (codes, strange), (gaps, unknown)
+
+
+SHARED = Regression(2, ny=("left", "right"), shared=True)
+CODES = [(3, "left"), (6, "u1[right]"), (100, "right"), (101, "right"), (150, "u2[left]")]
+
+
+@pytest.mark.parametrize("tracker", [TRACKER, AdaptiveKalman(), RLS(0.99), Bank()], ids=lambda one: type(one).__name__)
+def test_outputs_that_share_a_theta_are_judged_each_with_its_inputs(tracker, tmp_path):
+    signals, gaps = rows()
+    run, clean = track(SHARED, tracker, *signals, gate=True), track(SHARED, tracker, *gaps, gate=True)
+    assert [(one.sample, one.signal) for one in run.left_out] == CODES
+    np.testing.assert_array_equal(run.theta[20:], clean.theta[20:])
+    assert run.loglik == pytest.approx(clean.loglik, rel=1e-12)
+    live, parts = Live(SHARED, tracker, gate=True), Live(SHARED, tracker, gate=True)
+    for one in zip(*signals, strict=True):
+        live.update(*one)
+    for part in (slice(0, 11), slice(11, 101), slice(101, 200)):
+        parts.update_many(*(signal[part] for signal in signals))
+        parts = Live.from_bytes(parts.to_bytes())
+    fleet = track(SHARED, tracker, *(np.stack([one, one]) for one in signals), by="row", gate=True)
+    fleet.save(tmp_path / "fleet")
+    for found in (live, parts):
+        np.testing.assert_array_equal(found.theta, run.theta[-1])
+        assert found.left_out.last == tuple(run.left_out)
+    for found in (fleet[1], type(fleet).load(tmp_path / "fleet")[1]):
+        np.testing.assert_array_equal(found.theta, run.theta)
+        assert list(found.left_out) == list(run.left_out)
+
+
+def test_outputs_that_share_a_theta_are_tuned_on_one_decision():
+    signals, _ = rows()
+    tuned, selection = tune(SHARED, Kalman(), *signals, gate=True), select(SHARED, *signals)
+    run = track(SHARED, tuned.tracker, *signals, gate=tuned.left_out)
+    assert run.loglik == pytest.approx(tuned.loglik, rel=1e-12)
+    for found in (tuned.left_out, run.left_out, selection.left_out[0]):
+        assert [(one.sample, one.signal) for one in found] == CODES
+    with pytest.warns(
+        DataWarning, match=r"left: 1 value .*\(9999\); u2\[left\]: 1 .*; right: 2 values .*; u1\[right\]"
+    ):
+        track(SHARED, TRACKER, *signals)
+
+
+def test_several_outputs_are_tuned_on_the_decisions_of_each(tmp_path):
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((300, 2)), np.zeros((300, 2))
+    for t in range(1, 300):
+        y[t] = [[0.6, 0.2], [0.1, 0.7]] @ y[t - 1] + u[t - 1] + 0.05 * rng.standard_normal(2)
+    model, clean = ARX(1, [1, 1], ny=2), y.copy()
+    y[100, 0], y[[200, 201], 1], clean[100, 0], clean[[200, 201], 1] = 9999.0, -999.0, np.nan, np.nan
+    tuned, selection = tune(model, Kalman(), y, u, gate=True), select([model], y, u)
+    run = track(model, tuned.tracker, y, u, gate=tuned.left_out)
+    run.save(tmp_path / "run")
+    judged = track(model, tuned.tracker, y, u, gate=True)
+    np.testing.assert_array_equal(run.theta[30:], judged.theta[30:])
+    assert run.loglik == pytest.approx(tuned.loglik, rel=1e-3)  # the reference fills lags of what is missing
+    assert tuned.loglik == pytest.approx(tune(model, Kalman(), clean, u).loglik, rel=1e-3)
+    for found in (tuned.left_out, run.left_out, judged.left_out, type(run).load(tmp_path / "run").left_out):
+        assert {name: one.sample.tolist() for name, one in found.items()} == {"y1": [100], "y2": [200, 201]}
+    assert [len(selection[name].left_out[0]) for name in ("y1", "y2")] == [1, 2]
+    with pytest.raises(ValueError, match="give those of each by its name"):
+        track(model, TRACKER, y, u, gate=run["y1"].left_out)
 
 
 def by_sklearn(y, u, gate):

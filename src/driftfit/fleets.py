@@ -11,6 +11,7 @@ from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.on_all_cores import on_all_cores
+from driftfit.readings.left_out import LeftOut
 from driftfit.results import Exported, Track
 from driftfit.run import fleet, result
 from driftfit.show.plots import plot_fleet, plot_outputs
@@ -136,6 +137,11 @@ class Outputs(fleet.Outputs, Judged, public=True):
     def __getitem__(self, output: str | int) -> Track:
         """The record of one output, by name or index."""
         return _public(super().__getitem__(output))
+
+    @property
+    def left_out(self) -> dict[str, LeftOut]:
+        """What the gate left out of each output, by its name; ``track(.., gate=run.left_out)`` applies it again."""
+        return {name: self[name].left_out for name in self.outputs}
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
         """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""

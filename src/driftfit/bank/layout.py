@@ -49,12 +49,12 @@ from __future__ import annotations
 from collections import namedtuple
 from typing import Any
 
+import numpy as np
 from numba import types
 
 from driftfit.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, TableType
 from driftfit.bank.table import table_at as at
 from driftfit.engine.kernel import Array, kernel
-from driftfit.engine.tracker_part import open_at
 
 _Counters = namedtuple(
     "_Counters",
@@ -144,13 +144,13 @@ table_at = at(TableType(
 @kernel
 def report_at(s: Any) -> int:
     """Where the field `report` begins, the first of those whose length is not part of the compiled type."""
-    return open_at(s)  # type: ignore[no-any-return]
+    return s.end.ctypes.data + np.int64(s.end[0, 0])  # type: ignore[no-any-return]
 
 
 @kernel
 def memory_at(s: Any) -> int:
     """Where the field `memory` begins, behind the report."""
-    return open_at(s) + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
+    return report_at(s) + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
 
 
 @kernel

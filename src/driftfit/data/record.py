@@ -231,7 +231,9 @@ class Records(NamedTuple):
             {key: counts.get(self.keys[0], {}) for key in keys} for counts in (self.dropped, self.missing)
         )
         first, length = np.repeat(self.first, len(keys)), np.repeat(self.length, len(keys))
-        left_out = dict.fromkeys(keys, self.left_out[self.keys[0]]) if self.left_out else self.left_out
+        left_out: dict[Any, LeftOut] = {}
+        for own, one in self.left_out.items():  # by series, and by the name of an output
+            left_out |= {(key, own[1]) if isinstance(own, tuple) and self.outputs else key: one for key in keys}
         return self._replace(keys=keys, first=first, length=length, dropped=dropped, missing=missing, left_out=left_out)
 
     def labels_of(self, k: int) -> Labels:
@@ -344,11 +346,11 @@ class Known:
     def changed(self, interval: Any = None, noise: Any = None) -> Known:
         """The same numbers with other intervals or noise factors; a single row applies to all samples."""
         given = {INTERVAL: interval, NOISE: noise}
-        T = max(len(self), *(np.size(values) for values in given.values() if values is not None))
+        T = max(len(self), *(np.size(values, 0) for values in given.values() if np.ndim(values)), 1)
         columns = self.over(T).columns.copy()
         for place, values in given.items():
             if values is not None:
-                columns[:, place] = values if columns.ndim == 2 else np.reshape(values, (-1, 1))
+                columns[:, place] = np.reshape(values, (np.size(values, 0), -1)) if columns.ndim > 2 else values
         return Known(columns)
 
     def begun(self, factors: Mapping[int, float]) -> Known:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 from numba import types
 
 from driftfit.engine.kernel import State, kernel
@@ -34,23 +33,22 @@ def _part(record: Any) -> Any:
     )
 
 
-def _typed(context: Any, record: Any) -> Any:
-    part = _part(record)
+def seen_as(name: str, part: Any) -> Any:
+    """f(s): the same memory as a record s, as one of the type ``part(type of s)``."""
 
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.bitcast(given[0], context.get_value_type(part))
+    def typed(context: Any, record: Any) -> Any:
+        kind = part(record)
 
-    return part(record), build
+        def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            return builder.bitcast(given[0], context.get_value_type(kind))
+
+        return kind(record), build
+
+    return named_intrinsic(name, typed)
 
 
-tracker_part = named_intrinsic("tracker_part", _typed)
+tracker_part = seen_as("tracker_part", _part)
 """tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
-
-
-@kernel
-def open_at(s: State) -> int:
-    """The address of the first of the open fields of a record, of whose part a step sees."""
-    return s.end.ctypes.data + np.int64(s.end[0, 0])  # type: ignore[no-any-return]
 
 
 @kernel

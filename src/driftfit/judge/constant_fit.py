@@ -16,6 +16,7 @@ Their errors are one step ahead in the constants, but not in the linearisation, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -27,11 +28,13 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, unknown
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.engine.tiles import make_tile, output_type, repeat_tile
 from driftfit.models.base import Model
+from driftfit.readings.gate import Gate
 from driftfit.run.columns import COLLECTED, collect
 from driftfit.run.fleet import Fleet, Outputs
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.run.track import Decisions, track
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.kalman import Kalman
 
 STILL = Kalman(q=0.0, r=1.0)
@@ -152,14 +155,22 @@ def constant_errors(phi: Array, y: Array, weight: Array) -> Array:
     return e / root
 
 
+def decided_by(runs: Sequence[Track]) -> tuple[tuple[Record, ...], Decisions]:
+    """(the records of runs, without their times, as others take them; what a gate left out of each)."""
+    left_out: Decisions = {key: run.left_out for key, run in enumerate(runs) if len(run.left_out)}
+    return tuple(replace(run.used_record, time=None) for run in runs), left_out
+
+
 def constant_outputs(
     model: Model, y: Any, u: Any, reading: Reading, data: Any, by: Any = None
 ) -> dict[str, list[Track]]:
-    """Each output as a separate regression, tracked with constant parameters: by name, one run for every record.
+    """Each output as a separate regression, tracked with constant parameters, or by the default tracker where its gate
+    decides what is left out of the record: by name, one run for every record.
 
     Their predictions fill missing lags. Outputs that share one theta are one regression, on all rows.
     """
-    run = track(model, STILL, y, u, reading, data=data, by=by)
+    decides = reading.gate is True or isinstance(reading.gate, Gate)
+    run = track(model, AdaptiveKalman() if decides else STILL, y, u, reading, data=data, by=by)
     lanes = [run.rows] if isinstance(run, Track) else [one.rows for one in run.values()]
     if model.shared:
         return {"rows": lanes}

@@ -168,18 +168,8 @@ def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
     return judge  # type: ignore[no-any-return]
 
 
-@lru_cache(maxsize=256)
-def gate_step(
-    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
-    foresee: Step | None = None,
-) -> Any:  # fmt: skip
-    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
-
-    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
-    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
-    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
-    e^2 takes the place of s, which the tracker does not have.
-    """
+def judge_of(gate: Gate, implicit: bool = False, lends: bool = False, foresee: Step | None = None) -> Step:
+    """``step(s, l)``, which decides whether the sample of a lane is used; arguments as for `gate_step`."""
     notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
@@ -213,6 +203,23 @@ def gate_step(
         learn(s, seen, contradicts, own, most, l)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
+    return step  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=256)
+def gate_step(
+    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
+    foresee: Step | None = None,
+) -> Any:  # fmt: skip
+    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
+
+    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
+    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
+    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
+    e^2 takes the place of s, which the tracker does not have.
+    """
+    step = judge_of(gate, implicit, lends, foresee)
+
     @partial(kernel, inline=False)
     def judges(s: State) -> None:
         if s.gate_decided[0] < 1:
@@ -220,7 +227,7 @@ def gate_step(
         for l in range(s.reason.shape[0]):
             step(s, l)
 
-    judge_all, take_out = judges if curved else outlined(judges), outlined(taking_out(refuse, SIGNAL), short=True)
+    judge_all, take_out = judges if foresee else outlined(judges), outlined(taking_out(refuse, SIGNAL), short=True)
 
     @kernel
     def decide(s: State) -> None:

@@ -295,7 +295,8 @@ class Outputs(KeyedResults, OfRecord):
     def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
         alone, y, u, lane = self.programs[j].alone, self.y[:, j], self.u, self._lanes[j]
-        known, names, left = self.record.known.for_output(j), self.labels.u, NOTHING_LEFT_OUT
+        known, names = self.record.known.for_output(j), self.labels.u
+        left = self.records.left_out.get((self.records.keys[0], self.outputs[j]), NOTHING_LEFT_OUT)
         units = dict(self.labels.units)
         if alone is None or self.decided is not self:
             found, names = self._collected, self.names[j]
@@ -306,7 +307,7 @@ class Outputs(KeyedResults, OfRecord):
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:
-                left = left_out_of(lane.written("reason"), y, self.decided.ok[:, j], 0, self.programs[j].signals)
+                left = left_out_of(self.programs[j], lane.written("reason"), y, self.decided.ok[:, j])
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()
@@ -406,9 +407,7 @@ class Fleet(KeyedResults):
     def _run(self, j: int) -> Track:
         if self.records.outputs:
             k, output = divmod(j, self.records.ny)
-            whole = self._whole(k)
-            assert isinstance(whole, Outputs)
-            return whole[output]
+            return self._whole(k)[output]  # type: ignore[index]
         left_out = self.records.left_out.get(self.records.keys[j], NOTHING_LEFT_OUT)
         return Track(self.programs[j], self.records.part(j), self._lanes[j], self._starts.get(j), left_out)
 

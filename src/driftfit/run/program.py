@@ -25,10 +25,9 @@ from driftfit.engine.kernel import Array, nothing
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step
-from driftfit.readings.gate import start as gate_start
+from driftfit.readings.gate import AT_START, SIGNAL, Gate
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import First, foreseeing, gate_of, replayed
+from driftfit.run.gating import ROW, First, begun, gate_of, judging, replayed
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -82,6 +81,8 @@ class Program:
     """What decides which readings are used; None: all."""
     trackers: tuple[Tracker, ...] = ()
     """Those of all outputs, if each of several has a lane."""
+    rows: tuple[str, ...] = ()
+    """The names of outputs that share one theta, whose rows come one after the other."""
 
     def __post_init__(self) -> None:
         if (self.model.hidden is not None) != self.tracker.follows_states:
@@ -92,7 +93,7 @@ class Program:
 
     def __reduce__(self) -> Any:
         """Copies, and programs sent to another process, are made from the fields."""
-        return Program, (self.model, self.tracker, self.output, self.shared, self.gate, self.trackers)
+        return Program, (self.model, self.tracker, self.output, self.shared, self.gate, self.trackers, self.rows)
 
     @property
     def whole(self) -> Model:
@@ -125,10 +126,11 @@ class Program:
 
     @cached_property
     def signals(self) -> tuple[str, ...]:
-        """Names of the output and of the inputs."""
+        """Names of the output and of the inputs; of outputs that share one theta those of each, u1[y2] for example."""
         m = self.model.m
         inputs = self.model.input_names or (("u",) if m == 1 else tuple(f"u{j + 1}" for j in range(m)))
-        return (self.output or "y", *inputs)
+        each = ((name, *(f"{one}[{name}]" for one in inputs)) for name in self.rows)
+        return tuple(name for names in each for name in names) or (self.output or "y", *inputs)
 
     @property
     def start(self) -> State:
@@ -145,13 +147,13 @@ class Program:
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         if self.gate is None:
             return own
-        begun = gate_start(self.gate, self.model.n, self.model.m, self.model.linearised is not None)
-        return {**own, **begun, "raw_e": np.array(np.nan), "gate_refused": np.array(0)}
+        return {**own, **begun(self.gate, self.model, len(self.rows))}
 
     @property
     def scratch(self) -> tuple[str, ...]:
         """Fields that carry nothing from one sample to the next."""
-        return self.tracker.scratch if self.gate is None else (*self.tracker.scratch, "gate_fit", "gate_doubt", "raw_y")
+        of = ROW if self.rows else ""
+        return (*self.tracker.scratch, *((of + "gate_fit", of + "gate_doubt", "raw_y") if self.gate else ()))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -225,14 +227,9 @@ class Program:
         found = self._drivers.get((keep, steps))
         if found is None:
             model, own = self.model.fitted_to(self.steps)[1], self.steps if steps is None else steps
-            if self.gate is None:
-                found = drivers(model, own, keep)
-            else:
-                foresee = None if self.tracker.output_error else foreseeing(model, own)
-                implicit, lends = self.model.implicit is not None, not self.tracker.covariance
-                given = model.ages, model.refuse, implicit, lends, foresee
-                found = drivers(model, own, keep, gate_step(self.gate, *given))
-                found = found._replace(run=partial(self._decided, found.run))
+            judge = self.gate and judging(self.gate, self.model, self.tracker, (model, own), len(self.rows))
+            found = drivers(model, own, keep, judge)
+            found = found._replace(run=partial(self._decided, found.run)) if judge else found
             self._drivers[keep, steps] = found
         return found
 
@@ -254,22 +251,23 @@ class Program:
                 out["reason"][done - count : done] = found.reason[-count:]
             rest = slice(done, None)
             known = known if len(known) == 1 else known[rest]
-            if theta is NOWHERE:
-                self._decided(run, tile, y[rest], u[rest], known, out[rest])
-            else:
-                self._decided(run, tile, y[rest], u[rest], known, out, theta[rest])
+            into = (out[rest],) if theta is NOWHERE else (out, theta[rest])
+            self._decided(run, tile, y[rest], u[rest], known, *into)
         return len(y)
 
     def replay(self, tile: Array) -> First:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
         each = zip(self.trackers, self.model.outputs, strict=False)
         lanes = [replace(self, tracker=tracker, output=name) for tracker, name in each] or [self]
-        first, fresh = replayed(tile, self.model.m), tile_of(lanes, [{"gate_decided": np.array(1)}] * len(lanes))
+        first = replayed(tile, self.model.m, ROW if self.rows else "")
+        fresh = tile_of(lanes, [{"gate_decided": np.array(1)}] * len(lanes))
         coded, out = first.codes.any(axis=1), self.written(fresh, len(first.y))
         self.drivers().run(fresh, *first.without_codes(), first.known, out)
         fresh["gate_refused"][0] = np.sum(coded, axis=0)
         tile.view(np.uint8)[:] = fresh.view(np.uint8)
-        return first._replace(reason=np.where(coded, AT_START + SIGNAL * np.argmax(first.codes, axis=1), out["reason"]))
+        signal = np.argmax(first.codes, axis=1)
+        signal += (1 + self.model.m) * (np.arange(len(signal)) % (len(self.rows) or 1))[:, None]
+        return first._replace(reason=np.where(coded, AT_START + SIGNAL * signal, out["reason"]))
 
     @property
     def width(self) -> int:
@@ -458,12 +456,8 @@ def programs_of(
             raise ValueError(f"several outputs take one tracker, or one for each output by its name; got {tracker!r}.")
         check_ready(one)
     if model.shared:
-        if gate:
-            raise ValueError(
-                "gate: outputs that share one theta have no gate; leave gate= out, and give the ranges of the sensors, "
-                "such as limits={'y1': (0, 80)}."
-            )
-        return (Program(_row_model(model, tracker, inputs), tracker, shared=model),)
+        judge = gate_of(tracker, gate)
+        return (Program(_row_model(model, tracker, inputs), tracker, shared=model, gate=judge, rows=model.outputs),)
     bound = model.bind(inputs)
     programs = tuple(
         Program(bound, one, name, gate=gate_of(one, gate), trackers=trackers)

@@ -111,7 +111,7 @@ class Track(Plain, OfRecord):
 
     @cached_property
     def _rows(self) -> Track:
-        return Track(replace(self.program, shared=None), self.record, self._lane, self.start)
+        return Track(replace(self.program, shared=None), self.record, self._lane, self.start, self._left_out)
 
     @property
     def keeps_cov(self) -> bool:
@@ -267,8 +267,8 @@ class Track(Plain, OfRecord):
         """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
             return self._left_out
-        used, ages = self.decided.in_rows("ok") > 0.0, self.program.model.steps.ages
-        return left_out_of(self.in_rows("reason"), self.record.y, used, ages, self.program.signals)
+        used = self.decided.in_rows("ok") > 0.0
+        return left_out_of(self.program, self.in_rows("reason"), self.record.y, used)
 
     @cached_property
     def decided(self) -> Track:

@@ -123,7 +123,7 @@ def _task(
     model, records, failed = records_of(model, y, u, reading, data, by)
     records, gate = records.for_model(model, reading), reading.gate
     if isinstance(gate, LeftOut | Mapping):
-        (records, _), gate = decided(records, gate), False
+        (records, _), gate = decided(model, records, gate), False
     # several trackers, other than one for each output
     grid = not alone and not (isinstance(tracker, Mapping) and bool(records.outputs))
     many = grid or by is not None
@@ -254,16 +254,18 @@ def warn_astray(run: Track | KeyedResults) -> None:
 def warn_ungated(run: Result) -> None:
     """Warn of readings that look like codes and that no gate judged: once, whatever the number of series."""
     programs = [run.program] if isinstance(run, Track) else run.programs
-    if all(one.gate is not None or one.shared is not None for one in programs):
+    if all(one.gate is not None for one in programs):
         return
     given = run.record if isinstance(run, Track) else run.records
-    y, T = given.y.reshape(len(given.y), len(run.model.outputs) or 1), len(given.y)
-    first, length = (np.zeros(1, int), np.array([T])) if isinstance(given, Record) else (given.first, given.length)
-    inputs = np.any([screen(signal, first, length) for signal in given.u.T], axis=0) if given.u.shape[-1] else False
-    may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).ravel()
+    ny, rows = len(run.model.outputs) or 1, len(programs[0].rows) or 1
+    y, u = given.y.reshape(-1, ny), given.u.reshape(len(given.y) // rows, rows * given.u.shape[-1])
+    given = Records.of(given) if isinstance(given, Record) else given
+    first, length = given.first // rows, given.length // rows
+    inputs = np.any([screen(signal, first, length) for signal in u.T], axis=0) if u.shape[-1] else False
+    may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).reshape(-1, rows)
     if not may.any():
         return
-    warn_of_codes("track", [run] if isinstance(run, Track) else run.some(may))
+    warn_of_codes("track", [run] if isinstance(run, Track) else run.some(np.any(may, axis=1)))
 
 
 def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
@@ -295,12 +297,13 @@ def _named(name: str, values: Sequence[float]) -> str:
 
 def _codes(run: Track) -> dict[str, list[float]]:
     """The values of each signal, far apart from all others, that a run with a gate leaves out."""
-    signals = (run.record.y, *run.record.u.T)
+    signals = np.column_stack([run.record.y, run.record.u]).reshape(len(run), -1).T
     far = [np.flatnonzero(apart(signal)) for signal in signals]
     if not any(map(len, far)):
         return {}
     left, found = track_record(replace(run.program, gate=Gate()), run.record).left_out, {}
-    names, labels = run.program.signals, (run.labels.y, *(run.labels.u or run.program.signals[1:]))
+    names, given = run.program.signals, (run.labels.y, *run.labels.u)
+    labels = names if run.program.rows else (*given, *names[len(given) :])
     for name, label, signal, places in zip(names, labels, signals, far, strict=True):
         ages = 0 if name == names[0] else run.program.model.steps.ages
         blamed = left.sample[left.signal == name][:, None] - np.arange(ages + 1)
@@ -359,20 +362,25 @@ def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decision
         program = Program(model, reference, gate=gate_of(reference, gate))
         parts = zip(records.keys, map(records.part, range(len(records.keys))), strict=True)
         gate = {key: track_record(program, part).left_out for key, part in parts}
-    return decided(records, gate)
+    return decided(model, records, gate)
 
 
-def decided(records: Records, gate: LeftOut | Decisions) -> tuple[Records, Decisions]:
-    """The series with decisions that were made before: of one series, or by its key."""
-    if records.outputs:
-        raise ValueError("gate: decisions are those of one output; give gate=True, or take one output after the other.")
-    if isinstance(gate, LeftOut):
+def decided(model: Model, records: Records, gate: Any) -> tuple[Records, Decisions]:
+    """The series with decisions that were made before: of one series, or by its key; of several outputs by their names,
+    and of outputs that share one theta together."""
+    if isinstance(gate, LeftOut) or (records.outputs and set(gate) == set(records.outputs)):
         if len(records.keys) > 1:
             raise ValueError("gate: decisions of one run are for one series; give a mapping from every key to its own.")
         gate = {records.keys[0]: gate}
-    y, noise = records.y.copy(), np.array(np.broadcast_to(records.known.noise, len(records.y)))
-    for key, begin, count in zip(records.keys, records.first.tolist(), records.length.tolist(), strict=True):
-        if key in gate:
-            part = slice(begin, begin + count)
-            y[part], noise[part] = gate[key].applied(y[part], noise[part])
+    if records.outputs and not model.shared:
+        if any(isinstance(one, LeftOut) for one in gate.values()):
+            raise ValueError("gate: decisions are those of one output; give those of each by its name, run.left_out.")
+        gate = {(key, name): one for key, own in gate.items() for name, one in own.items()}
+    y, noise = records.y.copy(), np.array(np.broadcast_to(records.known.noise, records.y.shape))
+    for k, key in enumerate(records.keys):
+        part = slice(records.first[k], records.first[k] + records.length[k])
+        places = {(key, name): (part, j) for j, name in enumerate(records.outputs)} | {key: (part,)}
+        for at, one in ((at, gate[own]) for own, at in places.items() if own in gate):
+            changed = one.applied(y[at].ravel(), noise[at].ravel())
+            y[at], noise[at] = (values.reshape(y[at].shape) for values in changed)
     return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate

@@ -40,7 +40,7 @@ class Task(NamedTuple):
     model: Model
     records: tuple[Record, ...]
     left_out: Decisions | None = None
-    """What a gate left out of each record, by its key; None without a gate."""
+    """What a gate left out of each record, by its key."""
 
     @property
     def longest(self) -> int:

@@ -34,7 +34,7 @@ from driftfit.data.record import Reading
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
-from driftfit.judge.constant_fit import constant_outputs
+from driftfit.judge.constant_fit import constant_outputs, decided_by
 from driftfit.models.base import Model
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.run.live.conformal import quantile
@@ -132,13 +132,10 @@ def tune(
     quantile(level, "tune")  # whether there is one
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
-    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing)
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude, missing=missing, gate=gate)
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level if intervals else None, order_by)
-        if gate:
-            raise ValueError("tune: gate= is for one output; tune one output after the other, or leave gate= out.")
         return tune_outputs(model, tracker, y, u, reading, data, by, lambda task: _tuned(task, tracker, *options))
-    reading = reading._replace(gate=gate)
     task = _task(model, tracker, y, u, reading, data, by)
     return _tuned(task, tracker, method, groups, h, bounds, level if intervals else None, order_by)
 
@@ -160,7 +157,7 @@ def _tuned(
     _warn(search)
     built = knobs.build(search.x, sigma2)
     runs = run_task(task, built)
-    if task.left_out is None and not task.model.shared:
+    if not task.left_out and not task.model.shared:
         warn_of_codes("tune", runs)
     return Tuned(
         tracker=built,
@@ -229,7 +226,7 @@ def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data
     bound = model.bind(records.labels.u or records.u.shape[1])
     records, left_out = decide(bound, records, tracker.gated if reading.gate is None else reading.gate)
     records = records.for_trackers(bound, [tracker])
-    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out or None)
+    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))), left_out)
 
 
 class TunedOutputs(ByOutput[Tuned]):
@@ -239,6 +236,11 @@ class TunedOutputs(ByOutput[Tuned]):
     def tracker(self) -> dict[str, Tracker]:
         """The tracker of each output, by name, ready for `track` and `Live`."""
         return {name: one.tracker for name, one in self.items()}
+
+    @property
+    def left_out(self) -> dict[str, Any]:
+        """What a gate left out of each output, by its name."""
+        return {name: one.left_out for name, one in self.items()}
 
     @property
     def loglik(self) -> float:
@@ -259,5 +261,5 @@ def tune_outputs(
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
     runs = constant_outputs(model, y, u, reading, data, by)
-    tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
+    tuned = {name: one(Task(some[0].model, *decided_by(some))) for name, some in runs.items()}
     return tuned["rows"] if model.shared else TunedOutputs(tuned)

@@ -294,11 +294,12 @@ class Direct(Lower):
         """The address of the first entry of a field, computed once in a block."""
         if isinstance(field.kind, OpenRecord):
             return self._looked_up(beginning, field)
-        context, builder, key = self.context, self.builder, (field.record, field.name)
+        context, builder = self.context, self.builder
+        key = field.record, field.kind.offset(field.name)  # two types of one record may have fields of one name
         if key not in self._made:
             context.sentry_record_alignment(field.kind, field.name)
             data = context.get_data_type(_array(field).dtype)
-            self._made[key] = cgutils.get_record_member(builder, field.record, field.kind.offset(field.name), data)
+            self._made[key] = cgutils.get_record_member(builder, *key, data)
         return self._made[key]
 
     def _looked_up(self, look: Any, field: Field) -> Any:

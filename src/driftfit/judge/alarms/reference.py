@@ -142,7 +142,8 @@ def modelled(run: Track, rule: AlarmRule, reference: Reference) -> Modelled:
     enough = least("glr", n)
     first, start = first_third(run, usable, enough) if reference is None else normal_samples(run, reference)
     rows, names = every[first:start].copy(), run.model.names if n else ()
-    usable[run.left_out.sample[run.left_out.code == gate.FROZEN]] = False  # other refused readings are normal ones
+    if run.program.gate is not None:
+        usable[run.in_rows("reason") % gate.SIGNAL == gate.FROZEN] = False  # other refused readings are normal ones
     rows[:, n + OK] *= usable[first:start]
     ok = rows[:, n + OK] > BLAMED
     if ok.sum() < enough:

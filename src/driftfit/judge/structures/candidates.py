@@ -21,13 +21,14 @@ import numpy as np
 
 from driftfit.data.record import Known, Reading, Record, Records
 from driftfit.engine.kernel import Array
-from driftfit.judge.constant_fit import constant_least_squares, constant_outputs
+from driftfit.judge.constant_fit import constant_least_squares, constant_outputs, decided_by
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
 from driftfit.run.result import Track, burn_in, track_record
+from driftfit.run.track import Decisions
 from driftfit.trackers.base import Tracker
 
 TOGETHER = 32
@@ -196,8 +197,9 @@ def union_of(models: Sequence[Model]) -> Model | None:
 
 def pools_of(
     models: Sequence[Model], names: Sequence[str], y: Any, u: Any, reading: Reading, data: Any, by: Any
-) -> dict[str, Candidates]:
-    """The same for each output of bound models that have several; one entry if these share a theta."""
+) -> dict[str, tuple[Candidates, Decisions]]:
+    """The same for each output of bound models that have several, and what a gate left out of each record; one entry if
+    these share a theta."""
     if any(one.outputs != models[0].outputs or one.shared != models[0].shared or not linear(one) for one in models):
         raise ValueError(
             f"select: several outputs are compared for ARX or Regression models with the same outputs; got "
@@ -206,6 +208,6 @@ def pools_of(
     union = union_of(models)
     assert union is not None
     return {
-        name: pool_of(models, names, [replace(run.record, time=None) for run in runs], union, runs[0].model)
+        name: (pool_of(models, names, decided_by(runs)[0], union, runs[0].model), decided_by(runs)[1])
         for name, runs in constant_outputs(union, y, u, reading, data, by).items()
     }

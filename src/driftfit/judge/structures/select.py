@@ -287,10 +287,11 @@ def select(
     _, records, _ = records_of(candidates[0], y, u, reading, data, by)
     names = [repr(model) for model in candidates]
     if any(len(model.outputs) > 1 for model in candidates):
-        if gate:
-            raise ValueError("select: gate= is for one output; select for one output after the other.")
+        reading = reading._replace(gate=tracker.gated if gate is None else gate)
         pools = pools_of(_bound(candidates, records), names, y, u, reading, data, by)
-        found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
+        found = {
+            name: replace(_selected(*pool, tracker, search), left_out=left) for name, (pool, left) in pools.items()
+        }
         return found["rows"] if candidates[0].shared else ByOutput(found)
     if data is None and by is None:
         factor("drift", drift, len(records.y))

@@ -173,32 +173,32 @@ class Batched(Stream):
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
         """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
         if not self._windows and not any(alarm.rule.kind == "glr" for _, alarm in self._watching):
-            self._judged(y, u, known, out, time, self._samples - len(y))
+            self._judged(y, u, known, out, time, len(y))
             for lane, alarm in self._watching:
                 noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
                 alarm.take_many(out, lane, y[:, lane], noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
-            before = self._samples - len(y) + t
-            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], before)
+            self._judged(y[row], u[row], own, out[row], None if time is None else time[row], len(y) - t)
             self._keep(y[t], own[0], None if time is None else instant(time[t]))
 
-    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, before: int) -> None:
-        """Drive the tile over rows, with so many samples ``before`` them, and note what a gate leaves out."""
+    def _judged(self, y: Array, u: Array, known: Array, out: Array, time: Any, left: int) -> None:
+        """Drive the tile over rows, of which so many are ``left``, and note what a gate leaves out."""
         if self.programs[0].gate is None:
             self._loop(self._tile, y, u, known, out)
             return
         found: list[tuple[int, First]] = []
         self._loop(self._tile, y, u, known, out, found_too=found)
-        starts = dict(found)
+        starts, ny = dict(found), self._rows_per_instant
+        first = ny * self._samples - left
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
             at = None if time is None else instant(time[t])
             for lane in np.flatnonzero(out["reason"][t]).tolist():
                 if out["reason"][t, lane] % SIGNAL != AT_START:
-                    self._note(before + t, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+                    self._note((first + t) // ny, at, out["reason"].item(t, lane), y.item(t, lane), lane)
             if t in starts:
-                self._note_start(before + t, at, starts[t])
+                self._note_start((first + t) // ny, at, starts[t])
 
     def _noting(self, step: Any) -> Any:
         """The compiled step behind a gate, which notes what the gate leaves out."""
@@ -217,11 +217,12 @@ class Batched(Stream):
 
     def _note_start(self, sample: int, time: Any, first: First) -> None:
         """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
-        self.left_out, dt, begun = Tally(), first.known[:, 0, 0], sample + 1 - len(first.y)
+        self.left_out, dt, ny = Tally(), first.known[:, 0, 0], self._rows_per_instant
+        begun = sample + 1 - len(first.y) // ny
         times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
         for k, lane in np.argwhere(first.reason).tolist():
             at = None if times is None else times[k]
-            self._note(begun + k, at, first.reason.item(k, lane), first.y.item(k, lane), lane)
+            self._note(begun + k // ny, at, first.reason.item(k, lane), first.y.item(k, lane), lane)
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
