@@ -39,8 +39,8 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.hammerstein_wiener.blocks import Blocks, deviations
-from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.output_curve import Inverse
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, split
 from driftfit.run.program import lanes_of
 from driftfit.run.result import burn_in
