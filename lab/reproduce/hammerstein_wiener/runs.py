@@ -15,8 +15,8 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener.extended_kalman import ExtendedKalman
-from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.output_curve import Inverse
 from driftfit.models.hammerstein_wiener.output_error import OutputError
 from driftfit.models.hammerstein_wiener.thresholds import DeadZone
 from driftfit.results import Track

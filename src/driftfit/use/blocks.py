@@ -39,8 +39,8 @@ from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.hammerstein_wiener.blocks import Blocks, deviations
-from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.output_curve import Inverse
 from driftfit.models.hammerstein_wiener.separation import METHODS, Groups, LeastSquares, split
 from driftfit.run.program import lanes_of
 from driftfit.run.result import burn_in
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 BLOCK = 512
-"""Number of samples whose covariances are in memory at a time."""
+"""Number of samples whose covariances, or curves to be inverted, are in memory at a time."""
 WEAK = 1e-3
 """If 1 / |(1, c)| is below this, the first coefficient is close to zero relative to the others, and a bad gauge."""
 
@@ -277,10 +277,6 @@ def _covariance(run: Track, at: Array) -> tuple[Array, Array, Array]:
     return found[0], found[1], found[2]
 
 
-SAMPLES = 512
-"""Number of samples whose curves are inverted at a time."""
-
-
 @dataclass(frozen=True)
 class FreeRun:
     """``y``, ``w`` and ``v`` (T,), v the sum over all inputs; ``rising`` and ``stable`` (T,) bool: whether F increased,
@@ -314,8 +310,8 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
         lags = w[max(t - na, 0) : t][::-1]
         w[t] = drive[t] - a[: len(lags)] @ lags
     low, high = _ranges(run.y, found.model.out.scale)
-    for first in range(begin, T, SAMPLES):
-        now, before = slice(first, first + SAMPLES), slice(first - 1, min(first + SAMPLES, T) - 1)
+    for first in range(begin, T, BLOCK):
+        now, before = slice(first, first + BLOCK), slice(first - 1, min(first + BLOCK, T) - 1)
         inverse = Inverse(found.model, found.d[before], (low[before], high[before]))
         y[now], rising[now] = inverse(w[now]), inverse.rising
     w[:begin] = np.nan

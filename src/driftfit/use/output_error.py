@@ -41,8 +41,8 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, vector, whole
 from driftfit.models.hammerstein_wiener.basis import Basis, PiecewiseLinear, Sigmoid
 from driftfit.models.hammerstein_wiener.blocks import Blocks
-from driftfit.models.hammerstein_wiener.forward import Inverse
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.output_curve import Inverse
 from driftfit.models.hammerstein_wiener.output_error import SLOPE_SHARE
 from driftfit.run.result import Track, burn_in
 from driftfit.show.text import table_of

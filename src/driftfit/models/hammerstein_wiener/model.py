@@ -47,7 +47,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
-from driftfit.models.hammerstein_wiener.forward import play
+from driftfit.models.hammerstein_wiener.output_curve import play
 from driftfit.models.hammerstein_wiener.steps import DIGITS, build
 from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
 from driftfit.models.hammerstein_wiener.thresholds import settled
