@@ -323,7 +323,7 @@ class Body(Statements):
         """A call; its result is stored in a variable before the statement that uses it."""
         function = translate(self.unit, source, arguments)
         self.ops[-1] += function.operations
-        passed = [text for one in arguments if (text := passed(one))]
+        passed = [text for one in arguments if (text := as_argument(one))]
         if len(function.returns) > 1:
             names = [self.temporary(kind) for kind in function.returns]
             self.line(f"{function.name}({', '.join([*passed, *(f'&{name}' for name in names)])});")
@@ -337,7 +337,7 @@ class Body(Statements):
         return self.held(Value(function.returns[0], text))
 
 
-def passed(value: Value) -> str:
+def as_argument(value: Value) -> str:
     """The expression passed for an argument; nothing if its value is known."""
     if value.kind in ("record", "tile"):
         return "s, scratch"

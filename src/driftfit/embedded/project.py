@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.storage import fields
-from driftfit.embedded.functions import passed, translate
+from driftfit.embedded.functions import as_argument, translate
 from driftfit.embedded.values import (
     Function,
     Unit,
@@ -151,9 +151,13 @@ def _planning(program: Program, unit: Unit, h: int) -> Planning:
         name: Value("array" if shape else "real", f"p->{name}", shape=shape, strides=strides_of(shape))
         for name, shape in shapes.items()
     }
+    lanes = [
+        Value("array", begin_of(one), shape=one.shape[:-1], strides=one.strides[:-1])
+        for one in map(unit.field, ("y_lag", "u_lag"))
+    ]
     lags, wanted, limits, work = (
         Value("items", constant=list(one))
-        for one in (map(_without_lane, (unit.field("y_lag"), unit.field("u_lag"))), (p["target"], p["given"]),
+        for one in (lanes, (p["target"], p["given"]),
                     (p["low"], p["high"], p["move"]), (p[name] for name in own))
     )  # fmt: skip
     looking = [Value("record"), p["P"], p["caution"], Value("int", "k"), p["points"]]
@@ -161,13 +165,9 @@ def _planning(program: Program, unit: Unit, h: int) -> Planning:
     calls, operations = [], []
     for source, arguments in ((spread_of_state, looking), (plan.function, planned)):
         made = translate(unit, source, arguments)
-        calls.append(f"{made.name}({', '.join(text for one in arguments if (text := passed(one)))})")
+        calls.append(f"{made.name}({', '.join(text for one in arguments if (text := as_argument(one)))})")
         operations.append(made.operations)
     return Planning(shapes, calls[0], calls[1], (operations[0], operations[1]))
-
-
-def _without_lane(field: Value) -> Value:
-    return Value("array", begin_of(field), shape=field.shape[:-1], strides=field.strides[:-1])
 
 
 def _may_be_flag(start: Array) -> bool:
