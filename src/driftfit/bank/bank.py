@@ -60,7 +60,7 @@ from driftfit.models.base import Model
 from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing, take_root
-from driftfit.trackers.forms.excitation import not_learned, window
+from driftfit.trackers.forms.excitation import window
 from driftfit.trackers.forms.information import triangular_root
 
 
@@ -385,7 +385,7 @@ class Bank(Tracker):
         return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        hypotheses, lane = run.hypotheses, run.state
+        hypotheses = run.hypotheses
         kinds = [event.kind for event in hypotheses.found()]
         moved, wrong = kinds.count("change"), kinds.count("sensor")
         text = f"{moved} change{'' if moved == 1 else 's'}"
@@ -394,8 +394,6 @@ class Bank(Tracker):
         facts = [("Events", f"{text}; see run.hypotheses.events()")]
         if (count := hypotheses.impossible) > 0:
             facts.append(("Impossible", f"{count} samples that every hypothesis ruled out, left unused"))
-        if (never := np.isinf(lane["var"])).any():
-            facts.append(not_learned(run, np.array(run.names)[never]))
         return tuple(facts)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:

@@ -34,6 +34,7 @@ from driftfit.models.regression import Regression
 from driftfit.readings.left_out import remarks_of
 from driftfit.results import Track
 from driftfit.show.axes import BLUE, RED, panels
+from driftfit.show.summary import not_learned
 from driftfit.show.text import WIDTH
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -340,7 +341,7 @@ class TimeVaryingResults:
             "No. Observations": str(self.nobs), "Df Residuals": f"{self.df_resid:g}",
             "Log-Likelihood": f"{self.llf:.3f}",
             "AIC, BIC": f"{self.aic:.2f}, {self.bic:.2f}",
-            **dict(remarks_of(self.run.left_out)),
+            **dict((*remarks_of(self.run.left_out), *not_learned(self.run))),
         }  # fmt: skip
         apart = float(np.sqrt(np.mean((self.forecasts - self.fittedvalues)[self.run.ok] ** 2)))
         if apart > 1e-9 * float(np.sqrt(np.mean(self.run.y[self.run.ok] ** 2))):

@@ -144,7 +144,10 @@ def summarise(run: Track) -> Summary:
         repr(run.model), shortened(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik,
         information(run, 0, 2.0), information(run, 0), burn, rows, compare(run),
         _signals(run.labels) if run.labels.u or run.labels.y != "y" else "", span, counts(run.labels.dropped),
-        (*remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *run.tracker.remarks(run)),
+        (
+            *remarks, *_missing(run), *_undefined(run), *_level(run), *_gate(run), *not_learned(run),
+            *run.tracker.remarks(run),
+        ),
     )  # fmt: skip
 
 
@@ -201,6 +204,15 @@ def _undefined(run: Track) -> tuple[tuple[str, str], ...]:
         f"{count} samples at which the equation is not finite at the estimate (exp, or / by 0): begin elsewhere, start="
     )
     return (("No value", why),) if count else ()
+
+
+def not_learned(run: Track) -> tuple[tuple[str, str], ...]:
+    """Parameters that the record has not determined, with the reason."""
+    names = [name for name, std in zip(run.names, run.std[-1], strict=True) if np.isinf(std)]
+    why = "never varied separately from the others" if run.ok.any() else "no sample could be used"
+    if run.ok.any() and np.isnan(run.state.get("scale", 0.0)) and run.state.get("rank") == len(run.names):
+        why = "constants explain every output without error, so the noise is unknown"
+    return (("Not learned", f"{', '.join(names)}: {why}; std is inf"),) if names else ()
 
 
 def _level(run: Track) -> tuple[tuple[str, str], ...]:

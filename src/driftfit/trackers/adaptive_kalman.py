@@ -67,7 +67,6 @@ from driftfit.trackers.forms.excitation import (
     learn_scales,
     learned,
     no_excitation,
-    not_learned,
     window,
 )
 from driftfit.trackers.forms.information import partly_known
@@ -328,15 +327,10 @@ class AdaptiveKalman(Tracker):
         return learned(lane)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        lane, names = run.state, np.array(run.names)
-        never = np.isinf(lane["var"])
-        lately = ~never & ~learned(lane)
-        facts = []
-        if never.any():
-            facts.append(not_learned(run, names[never]))
-        if lately.any():
-            facts.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*facts, *colour(lane))
+        lane = run.state
+        lately = np.array(run.names)[np.isfinite(lane["var"]) & ~learned(lane)]
+        text = f"{', '.join(lately)}: not excited by the last regressors"
+        return (*((("Not learned now", text),) if len(lately) else ()), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

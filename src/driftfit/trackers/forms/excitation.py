@@ -20,7 +20,7 @@ Cost per sample: O(n^2); the flag inverts G when it is requested.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -112,11 +112,3 @@ def learned(lane: Mapping[str, Array]) -> Array:
     var, noise = np.where(np.isfinite(lane["var"]), lane["var"], 0.0), float(lane["r"])
     share = window(n) / max(float(lane["power_samples"]), window(n))
     return (own > 1.0) | (var * own * lane["c"] > LITTLE * share * noise)
-
-
-def not_learned(run: Any, names: Iterable[str]) -> tuple[str, str]:
-    """The line of a summary on parameters that a run has not determined."""
-    why = "never varied separately from the others" if run.ok.any() else "no sample could be used"
-    if run.ok.any() and np.isnan(run.state["scale"]) and run.state["rank"] == len(run.names):
-        why = "constants explain every output without error, so the noise is unknown"
-    return "Not learned", f"{', '.join(names)}: {why}; std is inf"
