@@ -16,7 +16,7 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation import LeastSquares, split
 from driftfit.models.hammerstein_wiener.thresholds import DeadZone, Saturation
 from driftfit.systems.arc_furnace import THRESHOLDS, valve
-from driftfit.use.blocks import fit_constant, free_run
+from driftfit.use.blocks import free_run
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)
@@ -186,8 +186,6 @@ def test_settings_that_several_inputs_cannot_have_are_refused():
             HammersteinWiener(1, 1, **nothing)
     with pytest.raises(ValueError, match="nb must be a whole number of at least 1"):
         HammersteinWiener(1, [1, 0])
-    with pytest.raises(ValueError, match="one input"):
-        fit_constant(VALVES, y, u)
     for basis in (Saturation(1.0), DeadZone(1.0)):
         with pytest.raises(ValueError, match="can only be an input block"):
             HammersteinWiener(1, 1, output=basis)
