@@ -156,7 +156,15 @@ def _tuned(
     largest = float(np.max(np.abs(y), initial=0.0))
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * largest) ** 2:
         raise ValueError(_without_noise(y, task.model.n))
-    _warn(search)
+    at_bound = [i for i, own in enumerate(knobs.owner) if search.at_bound(own)]
+    stuck = [knobs.names[i] for i in at_bound if np.isfinite(search.x[knobs.owner[i]])]  # zero is a valid result
+    if stuck:
+        warnings.warn(
+            f"tune: {', '.join(stuck)} ended at a bound of the search. The record does not determine it in that "
+            "direction, and the noise variance may be wrong; give bounds=(low, high) to search further.",
+            UserWarning,
+            stacklevel=3,
+        )
     built = knobs.build(search.x, sigma2)
     runs, left_out = run_task(task, built), task.left_out or {}
     if not task.left_out and not task.model.shared:
@@ -169,7 +177,7 @@ def _tuned(
         settings=len(search.x) + int(knobs.profiled),
         unknown=sum(unknown_at_start(run) for run in runs),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
-        at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
+        at_bound=tuple(knobs.names[i] for i in at_bound),
         interval=intervals_of(search, task, method, tracker, level),
         level=0.95 if level is None else level,
         left_out=left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT),
@@ -193,22 +201,6 @@ def _without_noise(y: Array, n: int) -> str:
         "tune: there is no noise to tune on: parameters explain every usable sample up to rounding, as if y had been "
         "computed from the inputs. Give the settings instead, such as Kalman(q=1e-4, r=1.0)."
     )
-
-
-def _warn(search: Search) -> None:
-    """Warn of settings that ended at a bound of the search; zero is a valid result."""
-    stuck = [
-        name
-        for name, i in zip(search.knobs.names, search.knobs.owner, strict=True)
-        if search.at_bound(i) and np.isfinite(search.x[i])
-    ]
-    if stuck:
-        warnings.warn(
-            f"tune: {', '.join(stuck)} ended at a bound of the search. The record does not determine it in that "
-            "direction, and the noise variance may be wrong; give bounds=(low, high) to search further.",
-            UserWarning,
-            stacklevel=4,
-        )
 
 
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:
