@@ -364,16 +364,6 @@ def test_errors():
         Live(ARX(1, 1), HELD).detect(rule)
 
 
-def test_an_idle_input_leaves_the_alarm_as_it_is():
-    """A column of zeros in the reference has no parameter: the gain's jump is found as without that column."""
-    rng = np.random.default_rng(1)
-    u, after = rng.normal(size=1600), np.arange(1600) >= 1200
-    y = (2.0 + 0.6 * after) * u + 1.0 + 0.5 * rng.normal(size=1600)
-    idle = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.25), y, np.c_[u, np.zeros(1600)])
-    begun = idle.detect(every=1000.0, reference=800).onsets
-    assert 1200 <= begun[begun >= 1200][0] < 1250
-
-
 def test_an_idle_input_among_others_is_no_movement():
     """The directions that a reference did not excite are computed, and their rounding is not excited either: no sample
     of such a record was judged."""

@@ -160,20 +160,11 @@ def test_damaged_records_and_the_table(selection):
     assert drawn == pytest.approx({row.name: order[row.name] - order[selection.best] for row in selection.rows[1:4]})
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        (([],), "no candidate"),
-        ((Regression(31),), "at most 30"),
-    ],
-)
-def test_wrong_settings(arguments, match):
+def test_wrong_settings(record, selection):
     u = np.random.default_rng(0).normal(size=(80, 31))
-    with pytest.raises(ValueError, match=match):
-        select(*arguments, u[:, 0], u, tracker=K)
-
-
-def test_other_wrong_settings(record, selection):
+    for models, match in (([], "no candidate"), (Regression(31), "at most 30")):
+        with pytest.raises(ValueError, match=match):
+            select(models, u[:, 0], u, tracker=K)
     with pytest.raises(ValueError, match="no variance"):
         select(ORDERS, *record, tracker=AugmentedFLS(mu=1.0))
     with pytest.raises(ValueError, match="no regressor"):

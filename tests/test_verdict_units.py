@@ -8,13 +8,6 @@ from test_verdict import judged, p_of, record
 from driftfit import Kalman, Regression, track
 
 
-def test_constancy_has_no_unit():
-    phi, y = record(240, 3)
-    p = p_of(phi, y)
-    for unit in (1e-12, 1e-9, 1e9):
-        assert p_of(phi, y * unit) == pytest.approx(p, rel=1e-6)
-
-
 @pytest.mark.parametrize("seed", [12, 24, 29])
 def test_counts_of_which_nine_of_ten_are_zero_decide_nothing_and_raise_nothing(seed):
     """The scale of Huber's fit vanishes, and with it the information matrix, which could not be inverted."""
@@ -27,7 +20,7 @@ def test_counts_of_which_nine_of_ten_are_zero_decide_nothing_and_raise_nothing(s
     assert judged(phi, steady) is None
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
+@pytest.mark.parametrize("unit", [1e-12, 1e9])
 def test_the_unit_of_y_changes_no_p_value(unit):
     """Noise with lags and a gain that wanders, as an instrument reads it in volts, and in nanovolts."""
     rng = np.random.default_rng(3)

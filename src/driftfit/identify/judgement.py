@@ -105,8 +105,7 @@ def mixed(y: Array, errors: Array, h: int) -> Array:
         w = weights[-1]
         weights.append(SHARE + (1.0 - 2.0 * SHARE) / (1.0 + (1.0 - w) / w * ratio))
     share = np.array(weights[: len(y)])
-    found: Array = share * e[0] + (1.0 - share) * e[1]
-    return found
+    return np.asarray(share * e[0] + (1.0 - share) * e[1])
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:

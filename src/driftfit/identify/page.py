@@ -107,12 +107,6 @@ def others(answer: Identification) -> list[str]:
     return [f"; {', '.join(each)} {verbs[len(each) > 1]}{rest}" for each, verbs, rest in said if each]
 
 
-def units(answer: Identification, name: str) -> str:
-    """The units of an effect, where both are known."""
-    known = [answer.roles.units.get(one) for one in dict.fromkeys((answer.roles.output, name))]
-    return f" {' per '.join(filter(None, known))}" if all(known) else ""
-
-
 def curve(answer: Identification) -> str:
     """What the curve is made of."""
     nats = f"{answer.cause.curve[0]:.0f} nats over a straight line"
@@ -215,10 +209,11 @@ def unit(answer: Identification | ManyIdentified) -> str:
 
 
 def effect(answer: Identification, one: Effect) -> str:
-    """The size of an effect, and whether it moves."""
+    """The size of an effect, with its units where both are known, and whether it moves."""
     moved = ", moves" if any(move.what == one.name for move in answer.moves) else ""
-    size = f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units(answer, one.name)}"
-    return f"{size}, {delay(answer, one.name)}{moved}"
+    known = [answer.roles.units.get(name) for name in dict.fromkeys((answer.roles.output, one.name))]
+    units = f" {' per '.join(filter(None, known))}" if all(known) else ""
+    return f"{answer.effect} {number(one.gain)} +- {one.std:.2g}{units}, {delay(answer, one.name)}{moved}"
 
 
 def lines(answer: Identification) -> list[tuple[str, str]]:
@@ -254,7 +249,7 @@ def as_json(answer: Identification) -> dict[str, Any]:
     roles, structure = answer.roles, answer.structure
     second = [(structure_text(answer, shape), *behind) for shape, *behind in structure.second]
     inputs = {roles.inputs[j]: {"nb": nb, "nk": nk, "delays": structure.delays[j]} for j, nb, nk in structure.shape[1]}
-    found: dict[str, Any] = finite({
+    return dict(finite({
         "schema": NAME, "answer": answer.kind, "headline": conclusion(answer),
         "model": repr(answer.model), "p": answer.verdict.p, "roles": roles.plain,
         "structure": {"na": structure.na, "inputs": inputs, "second": second, "log": structure.log},
@@ -262,8 +257,7 @@ def as_json(answer: Identification) -> dict[str, Any]:
         "commands": commands(answer), "unit": unit(answer),
         "why": answer.why,
         **{name: getattr(answer, name) for name in ("effects", "moves", "errors", "memory", "notes", "undecided")},
-    })  # fmt: skip
-    return found
+    }))  # fmt: skip
 
 
 def figure(answer: Identification) -> Figure:
@@ -456,8 +450,7 @@ class ManyIdentified(Printed):
         rows = {str(row.key): {"moves": row.drifts, "p": row.verdict.p, "q": row.q} for row in self.verdict.rows}
         worst = {str(key): one.json() for key, one in self.worst.items()}
         shown = {"schema": f"{NAME}/records", "headline": self.headline, "model": repr(self.model), "notes": self.notes}
-        data: dict[str, Any] = finite(shown | {"roles": self.roles.plain, "records": rows, "worst": worst})
-        return data
+        return dict(finite(shown | {"roles": self.roles.plain, "records": rows, "worst": worst}))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         first = f"{len(self.verdict)} records with one structure: {self.model!r}"

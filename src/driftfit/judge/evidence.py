@@ -16,7 +16,7 @@ from driftfit.judge.compare import Errors, errors
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Distinct, Rows, judged_by_others, regressors
 from driftfit.judge.statistics.coarse_readings import drawn_within
-from driftfit.judge.statistics.robust import Basis, Fit, fit_in, noisy, orthonormal, sole
+from driftfit.judge.statistics.robust import fit_in, noisy, orthonormal, sole
 from driftfit.run.result import Track
 
 REJECTED = 0.05
@@ -28,8 +28,10 @@ def least_rows(n: int) -> int:
     return 4 * n + 8
 
 
-def _testable(rows: Rows) -> tuple[Basis, Array, Fit] | None:
-    """(basis, outputs, constants); None if rows are too few, do not determine every parameter, or have no noise."""
+def judged_rows(
+    rows: Rows, level: float, order: int | None = None, dates: float = LEVEL, fewest: int | None = None
+) -> Changes | None:
+    """The changes of rows; None if they are too few, do not determine every parameter, or have no noise."""
     N, n = rows.phi.shape
     if n == 0 or least_rows(n) > N:
         return None
@@ -38,17 +40,8 @@ def _testable(rows: Rows) -> tuple[Basis, Array, Fit] | None:
         return None
     y = rows.y if rows.step is None else drawn_within(basis.Q, rows.y, rows.step)
     fit = fit_in(basis, y)
-    return (basis, y, fit) if noisy(fit, rows.phi, y) else None
-
-
-def judged_rows(
-    rows: Rows, level: float, order: int | None = None, dates: float = LEVEL, fewest: int | None = None
-) -> Changes | None:
-    """The changes of rows; None if these cannot be tested."""
-    known = _testable(rows)
-    if known is None:
+    if not noisy(fit, rows.phi, y):
         return None
-    basis, y, fit = known
     found = changes(modelled(rows.phi, basis, y, fit, rows.lags, rows.root, order, fewest), level, dates)
     if rows.step is None or y is not rows.y or not len(found.found.breaks):
         return found

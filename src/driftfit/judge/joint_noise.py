@@ -72,8 +72,16 @@ class JointNoise:
             )
         if memory is not None and not memory > ny + 1.0:
             raise ValueError(f"joint_noise: memory must be above {ny + 1} samples for {ny} outputs; got {memory!r}.")
-        self.run = run
-        q, self.phi = _relative(run)
+        self.run, out = run, run.replayed(store, ("scale", "phi", "valid"))
+        first = np.array([float((one.start or {}).get("scale", np.nan)) for one in run.values()])
+        if not (out["phi"] == out["phi"][..., :1]).all():
+            raise ValueError("joint_noise: needs outputs with the same regressors, such as those of ARX or Regression.")
+        last = np.concatenate([first[None], out["scale"][:-1]])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            begun = np.isnan(last) & (out["e"] != 0.0)  # the sample that gave the first scale
+            q = np.where(begun, out["e"] ** 2 / out["scale"], out["s"] / last)  # variances in units of the noise
+        q = np.where((out["ok"] > 0.0) & np.isfinite(q) & (q > 0.0), q, np.nan)
+        self.phi = np.where(out["valid"][:, :1] > 0.0, out["phi"][..., 0], np.nan)
         keep = 1.0 if memory is None else 1.0 - 1.0 / memory
         z = run.innovation / np.sqrt(q)
         whole = np.isfinite(z).all(axis=1)
@@ -124,20 +132,6 @@ class JointNoise:
             rows_u[place] = np.linalg.solve(L, blocks[place])
         names = tuple(name for each in run.names for name in each)
         return Regression(names, ny=ny, shared=True), rows_y, rows_u
-
-
-def _relative(run: Outputs) -> tuple[Array, Array]:
-    """q (T, ny): innovation variances in units of the noise, NaN for samples that have none; and the regressors."""
-    out = run.replayed(store, ("scale", "phi", "valid"))
-    first = np.array([float((one.start or {}).get("scale", np.nan)) for one in run.values()])
-    if not (out["phi"] == out["phi"][..., :1]).all():
-        raise ValueError("joint_noise: needs outputs with the same regressors, such as those of ARX or Regression.")
-    before = np.concatenate([first[None], out["scale"][:-1]])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        begun = np.isnan(before) & (out["e"] != 0.0)  # the sample that gave the first scale
-        q = np.where(begun, out["e"] ** 2 / out["scale"], out["s"] / before)
-    q = np.where((out["ok"] > 0.0) & np.isfinite(q) & (q > 0.0), q, np.nan)
-    return q, np.where(out["valid"][:, :1] > 0.0, out["phi"][..., 0], np.nan)
 
 
 def _log_density(z: Array, q: Array, S: Array, d: Array) -> Array:

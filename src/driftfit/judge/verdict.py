@@ -181,9 +181,8 @@ class Verdict(Printed):
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in sentences."""
-        return tuple(
-            filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._indistinct(), self._caution()))
-        )
+        which = f"What moves: {'; '.join(map(clause, self.events))}." if self.events else ""
+        return tuple(filter(None, (f"{self._drift()} {self._gain()}", which, self._indistinct(), self._caution())))
 
     def _drift(self) -> str:
         if self.hidden:
@@ -215,9 +214,6 @@ class Verdict(Printed):
             f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
             "A drift that is small compared with the noise cannot be ruled out."
         )
-
-    def _which(self) -> str:
-        return f"What moves: {'; '.join(map(clause, self.events))}." if self.events else ""
 
     def _indistinct(self) -> str:
         idle = [name for name in self.held if not any(name in group for group in self.dependent)]

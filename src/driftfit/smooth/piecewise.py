@@ -49,17 +49,12 @@ class Segments:
         known = replayed["ok"][:, 0] > 0.0
         if run.tracker.weighs:  # samples with a sensor fault carry no information about the segment
             known &= ~faulty(run, Hypotheses(run).found())
-        self._ok, self._phi, self._y = known, replayed["phi"][..., 0], replayed["y"][:, 0]
-        self._weight = 1.0 / replayed["used_noise"][:, 0]
-        self._solve(r)
-
-    def _solve(self, r: float | None) -> None:
-        thetas, covs, rest, free = [], [], 0.0, 0
-        used = []
+        phi, y, weight = replayed["phi"][..., 0], replayed["y"][:, 0], 1.0 / replayed["used_noise"][:, 0]
+        thetas, covs, used, rest, free = [], [], [], 0.0, 0
         for a, b in zip(self.bounds[:-1], self.bounds[1:], strict=True):
-            rows = np.flatnonzero(self._ok[a:b]) + a
-            root = np.sqrt(self._weight[rows])
-            A, d = self._phi[rows] * root[:, None], self._y[rows] * root
+            rows = np.flatnonzero(known[a:b]) + a
+            root = np.sqrt(weight[rows])
+            A, d = phi[rows] * root[:, None], y[rows] * root
             size = column_sizes(A, np.sum)
             A /= size
             U, long, axes = np.linalg.svd(A, full_matrices=False)

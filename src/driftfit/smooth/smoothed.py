@@ -154,7 +154,12 @@ class Smoothed(Bands):
         if order_by is not None and run.rows_per_instant > 1:
             raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
         if getattr(run.tracker, "laws", None):
-            return cls._by_laws(run, order_by, undetermined)
+            if order_by is not None:
+                raise ValueError("smooth: order_by= needs random walks, and laws hold in time; leave it out.")
+            path, weight = laws.smooth(run.rows)
+            smoothed = cls(path, Data(int(np.count_nonzero(weight)), np.nan, run.tracker.r, True), run)  # type: ignore[attr-defined]
+            smoothed._fit = smoothed._of_samples(weight, path)
+            return smoothed._determined(np.isinf(smoothed._path.var), undetermined, int(path.rank[-1]))
         walk = walk_of(run.rows, turned=True)
         data, slopes = Data.of(walk), len(walk.trend) > 0
         weight = walk.weight.copy() if keep != "std" else NONE
@@ -168,16 +173,6 @@ class Smoothed(Bands):
         smoothed.std = smoothed._std(path.var)
         smoothed._path = path._replace(var=NONE, rho=NONE, c=NONE)
         return smoothed._determined(unknown, undetermined, len(run.names) * (2 if slopes else 1))
-
-    @classmethod
-    def _by_laws(cls, run: Track, order_by: Any, undetermined: str) -> Smoothed:
-        """Smooth a run whose parameters have laws (`driftfit.smooth.laws`)."""
-        if order_by is not None:
-            raise ValueError("smooth: order_by= needs random walks, and laws hold in time; leave it out.")
-        path, weight = laws.smooth(run.rows)
-        smoothed = cls(path, Data(int(np.count_nonzero(weight)), np.nan, run.tracker.r, True), run)  # type: ignore[attr-defined]
-        smoothed._fit = smoothed._of_samples(weight, path)
-        return smoothed._determined(np.isinf(smoothed._path.var), undetermined, int(path.rank[-1]))
 
     def _determined(self, unknown: Array, undetermined: str, size: int) -> Smoothed:
         """This path, NaN or an error where the record does not determine parameters, ``unknown`` (T, n)."""
@@ -256,8 +251,7 @@ class Smoothed(Bands):
 
     @cached_property
     def leverage(self) -> Array:
-        leverage: Array = 1.0 - self._fit.c**2
-        return leverage
+        return np.asarray(1.0 - self._fit.c**2)
 
     @cached_property
     def residual(self) -> Array:
@@ -280,8 +274,7 @@ class Smoothed(Bands):
     def _scaled(self, values: Array) -> Array:
         """Values in units of y; NaN where there is no sample."""
         weight = np.where(self.weight > 0.0, self.weight, np.nan)
-        scaled: Array = values / np.sqrt(weight)
-        return scaled
+        return np.asarray(values / np.sqrt(weight))
 
     @property
     def dynamic_cost(self) -> float:
@@ -295,8 +288,7 @@ class Smoothed(Bands):
 
     def lag_cov(self, t: int) -> Array:
         """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` if given."""
-        lag: Array = self.r * self._covariances.lag_cov[t]
-        return lag
+        return np.asarray(self.r * self._covariances.lag_cov[t])
 
     def blocks(
         self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0

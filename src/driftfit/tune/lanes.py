@@ -62,12 +62,6 @@ class Scores(NamedTuple):
     samples: Array
 
     @property
-    def h_step(self) -> Array:
-        """Mean square of the errors h samples ahead."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self.errors / self.scored)
-
-    @property
     def power(self) -> Array:
         """Mean squares of the regressors over the factors of the noise variance, (n, S)."""
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -109,18 +109,16 @@ def still(task: Task, scored_by: Tracker) -> tuple[Array, float]:
     scores = score(task, [scored_by])
     power, variance = scores.power[:, 0], float(scores.sigma2()[0])
     if not np.any(power > 0.0):
-        raise ValueError(f"tune: there is nothing to tune on: {_unusable(task)}")
+        y, u = (np.concatenate([np.ravel(getattr(record, name)) for record in task.records]) for name in "yu")
+        why = (
+            f", because all of {len(y)} outputs are missing"
+            if not np.isfinite(y).any()
+            else ", because all inputs are missing"
+            if len(u) and not np.isfinite(u).any()
+            else " with a regressor other than zero"
+        )
+        raise ValueError(f"tune: there is nothing to tune on: the record has no usable sample{why}.")
     return power, variance if 0.0 < variance < np.inf else 1.0
-
-
-def _unusable(task: Task) -> str:
-    """Why no sample of a record counts, as a sentence."""
-    y, u = (np.concatenate([np.ravel(getattr(record, name)) for record in task.records]) for name in "yu")
-    if not np.isfinite(y).any():
-        return f"the record has no usable sample, because all of {len(y)} outputs are missing."
-    if len(u) and not np.isfinite(u).any():
-        return "the record has no usable sample, because all inputs are missing."
-    return "the record has no usable sample with a regressor other than zero."
 
 
 def constant(task: Task, tracker: Any) -> Tracker:

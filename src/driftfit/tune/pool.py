@@ -86,8 +86,7 @@ class Pooled(Printed):
     @property
     def spread(self) -> Array:
         """Standard deviation of each parameter over units, (n,)."""
-        spread: Array = np.sqrt(np.diag(self.cov))
-        return spread
+        return np.asarray(np.sqrt(np.diag(self.cov)))
 
 
 def pool(fleet: Mapping[Hashable, Track], noise: str = "given") -> Pooled:

@@ -68,8 +68,15 @@ class Counted:
 
 
 def minimise(f: Objective, knobs: Knobs) -> Array:
-    """The best point (p,)."""
-    return _zeros(f, knobs, _refine(f, knobs, _grid(f, knobs)))
+    """The best point (p,), with knobs at zero where that is not worse, after which the others are refined again."""
+    x, changed = _refine(f, knobs, _grid(f, knobs)), False
+    for i in np.flatnonzero(knobs.zero & np.isfinite(x)):
+        points = np.repeat(x[None], 2, axis=0)
+        points[1, i] = -np.inf
+        values = f(points)
+        if values[1] <= values[0]:
+            x, changed = points[1], True
+    return _refine(f, knobs, x) if changed else x
 
 
 def _axis(knobs: Knobs, i: int) -> Array:
@@ -82,7 +89,8 @@ def _grid(f: Objective, knobs: Knobs) -> Array:
     """A grid over all knobs with the same range together, with the others at their middle; then knob by knob."""
     p = len(knobs.low)
     together = (knobs.low == knobs.low[0]) & (knobs.high == knobs.high[0]) & (knobs.zero == knobs.zero[0])
-    points = np.where(together, _axis(knobs, 0)[:, None], _middle(knobs))
+    middle = np.clip(np.zeros(p), knobs.low, knobs.high)  # 0 is the scale of the data
+    points = np.where(together, _axis(knobs, 0)[:, None], middle)
     values = f(points)
     x: Array = points[np.argmin(values)].copy()
     best = values.min()
@@ -97,11 +105,6 @@ def _grid(f: Objective, knobs: Knobs) -> Array:
         if not best < before:
             break
     return x
-
-
-def _middle(knobs: Knobs) -> Array:
-    """The value of a knob that is not varied: 0, which is the scale of the data, or the nearest end."""
-    return np.asarray(np.clip(np.zeros(len(knobs.low)), knobs.low, knobs.high))
 
 
 def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
@@ -132,19 +135,6 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
     refined: Array = x.copy()
     refined[free] = found.x
     return refined
-
-
-def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
-    """Set knobs to zero where that is not worse, and refine the others again."""
-    candidates = np.flatnonzero(knobs.zero & np.isfinite(x))
-    changed = False
-    for i in candidates:
-        points = np.repeat(x[None], 2, axis=0)
-        points[1, i] = -np.inf
-        values = f(points)
-        if values[1] <= values[0]:
-            x, changed = points[1], True
-    return _refine(f, knobs, x) if changed else x
 
 
 def curvature(f: Objective, x: Array, free: Array) -> Array:
@@ -194,8 +184,7 @@ class Search:
         """
         H = curvature(self.f, self.x, self.free) + np.diag((self.knobs.high - self.knobs.low)[self.free] ** -2.0)
         convex = np.isfinite(H).all() and np.linalg.eigvalsh(H).min(initial=np.inf) > 0.0
-        C: Array = np.linalg.inv(H) if convex else np.full(H.shape, np.nan)
-        return C
+        return np.asarray(np.linalg.inv(H) if convex else np.full(H.shape, np.nan))
 
     def ridge(self, i: int) -> Array:
         """How the other knobs move with knob i so that the objective rises least, to second order; 1 for i itself."""
@@ -354,7 +343,9 @@ class Criterion:
             scores = score(self.task, trackers)
             return -scores.loglik(scores.sigma2() if self.knobs.profiled else 1.0)
         if self.method == "h-step":
-            squares = score(self.task, trackers, self.h).h_step
+            scores = score(self.task, trackers, self.h)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                squares = scores.errors / scores.scored
         else:
             squares = np.array([_smoothed_score(self.task, tracker, self.method) for tracker in trackers])
         tiny = np.finfo(float).tiny  # a perfect fit is the best possible result and must have a logarithm

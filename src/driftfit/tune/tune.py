@@ -36,9 +36,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.judge.constant_fit import constant_outputs, decided_by
 from driftfit.models.base import Model
-from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
+from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.live.conformal import quantile
-from driftfit.run.track import Decisions, decide, records_of, warn_of_codes
+from driftfit.run.track import decide, records_of, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
 from driftfit.tune.inference import unknown_at_start
@@ -151,12 +151,22 @@ def _tuned(
     search = Search(f, knobs, minimise(f, knobs))
     final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
-    largest = float(np.max(np.abs(_outputs(task)), initial=0.0))
+    y = np.concatenate([record.y.ravel() for record in task.records])
+    y = y[np.isfinite(y)]
+    largest = float(np.max(np.abs(y), initial=0.0))
     if knobs.profiled and tracker.covariance and not sigma2 > (ROUNDING * largest) ** 2:
-        raise ValueError(_without_noise(task))
-    _warn(search)
+        raise ValueError(_without_noise(y, task.model.n))
+    at_bound = [i for i, own in enumerate(knobs.owner) if search.at_bound(own)]
+    stuck = [knobs.names[i] for i in at_bound if np.isfinite(search.x[knobs.owner[i]])]  # zero is a valid result
+    if stuck:
+        warnings.warn(
+            f"tune: {', '.join(stuck)} ended at a bound of the search. The record does not determine it in that "
+            "direction, and the noise variance may be wrong; give bounds=(low, high) to search further.",
+            UserWarning,
+            stacklevel=3,
+        )
     built = knobs.build(search.x, sigma2)
-    runs = run_task(task, built)
+    runs, left_out = run_task(task, built), task.left_out or {}
     if not task.left_out and not task.model.shared:
         warn_of_codes("tune", runs)
     return Tuned(
@@ -167,23 +177,16 @@ def _tuned(
         settings=len(search.x) + int(knobs.profiled),
         unknown=sum(unknown_at_start(run) for run in runs),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
-        at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
+        at_bound=tuple(knobs.names[i] for i in at_bound),
         interval=intervals_of(search, task, method, tracker, level),
         level=0.95 if level is None else level,
-        left_out=_of_one(task.left_out or {}),
+        left_out=left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT),
         _search=search,
     )
 
 
-def _outputs(task: Task) -> Array:
-    """Every output that is known, one after the other."""
-    y = np.concatenate([record.y.ravel() for record in task.records])
-    return np.asarray(y[np.isfinite(y)])
-
-
-def _without_noise(task: Task) -> str:
-    """Why a record determines no noise variance, and what to do."""
-    y, n = _outputs(task), task.model.n
+def _without_noise(y: Array, n: int) -> str:
+    """Why known outputs y (N,) determine no noise variance beside n parameters, and what to do."""
     if len(y) <= n:
         return (
             f"tune: there is no noise to tune on: {len(y)} outputs are known, which {n} parameters explain without "
@@ -198,27 +201,6 @@ def _without_noise(task: Task) -> str:
         "tune: there is no noise to tune on: parameters explain every usable sample up to rounding, as if y had been "
         "computed from the inputs. Give the settings instead, such as Kalman(q=1e-4, r=1.0)."
     )
-
-
-def _warn(search: Search) -> None:
-    """Warn of settings that ended at a bound of the search; zero is a valid result."""
-    stuck = [
-        name
-        for name, i in zip(search.knobs.names, search.knobs.owner, strict=True)
-        if search.at_bound(i) and np.isfinite(search.x[i])
-    ]
-    if stuck:
-        warnings.warn(
-            f"tune: {', '.join(stuck)} ended at a bound of the search. The record does not determine it in that "
-            "direction, and the noise variance may be wrong; give bounds=(low, high) to search further.",
-            UserWarning,
-            stacklevel=4,
-        )
-
-
-def _of_one(left_out: Decisions) -> LeftOut | Decisions:
-    """The decisions of a single record without its key."""
-    return left_out if len(left_out) > 1 else next(iter(left_out.values()), NOTHING_LEFT_OUT)
 
 
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:

@@ -137,7 +137,9 @@ def averaged(search: Search, draws: int, seed: int) -> Averaged:
 
 def _draws(f: Callable[[Array], Array], knobs: Knobs, best: Array, draws: int, rng: np.random.Generator) -> Array:
     """Draws (D, p) of the knobs from their posterior."""
-    p, slope = len(best), _log_prior(knobs)
+    p, slope = len(best), np.zeros(len(best))
+    for name, i in zip(knobs.names, knobs.owner, strict=True):  # a drift q = 10^x has a flat prior in 10^(x / 2)
+        slope[i] = 0.5 * np.log(10.0) * (name.startswith("q") - float(name.startswith("mu")))
     start = np.clip(np.round(best, 1), knobs.low, knobs.high)  # the same whatever the last digits of the search
     at = _within(start + APART * rng.standard_normal((CHAINS, p)), knobs)
     now = at @ slope - f(at)
@@ -155,14 +157,6 @@ def _draws(f: Callable[[Array], Array], knobs: Knobs, best: Array, draws: int, r
             kept.append(at)
     every: Array = np.concatenate(kept)
     return np.asarray(every[np.linspace(0, len(every) - 1, draws).round().astype(int)])
-
-
-def _log_prior(knobs: Knobs) -> Array:
-    """Slopes (p,) of the log prior over the knobs: a drift q = 10^x has a flat prior in 10^(x / 2)."""
-    slope = np.zeros(len(knobs.low))
-    for name, i in zip(knobs.names, knobs.owner, strict=True):
-        slope[i] = 0.5 * np.log(10.0) * (name.startswith("q") - float(name.startswith("mu")))
-    return slope
 
 
 def _within(points: Array, knobs: Knobs) -> Array:

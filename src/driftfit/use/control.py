@@ -110,7 +110,13 @@ def control(
     most = np.inf if move is None else numbers("control", "move", move, low=0.0, strict=True)
     low, high, step = (np.array(np.broadcast_to(np.asarray(one, float), model.m)) for one in (*ends, most))
     work = {name: np.zeros(shape) for name, shape in room(model, tracker, horizon).items()}
-    _look_ahead(live, lane, c, work["points"])
+    program = live.programs[0]
+    tile = program.resting(lane)
+    update, nothing = program.drivers().updater(tile, program.model.m), one_or_all(np.full(program.model.m, np.nan))
+    ahead = state_of(tile)
+    for k in range(horizon):  # theta at the next samples
+        update(as_compiled(tile), np.nan, nothing)
+        spread(ahead["theta"], tracker.cov(ahead), c, k, work["points"])
     wanted = np.array(goal, float), np.array(given, float)
     lags = lane["y_lag"], lane["u_lag"]
     why = plan(terms_of(model), lags, late, wanted, (low, high, step), cost, share, tuple(work.values()))
@@ -118,14 +124,3 @@ def control(
         raise ValueError("control: the inputs given as u= leave none within the limits and moves.")
     chosen = work["u"]
     return Plan(chosen[:, 0] if model.m == 1 else chosen, work["y_hat"], work["theta_std"], HELD[why])
-
-
-def _look_ahead(live: Live, lane: Any, c: float, points: Array) -> None:
-    """Points (S, h, n) with the mean and covariance of theta at the next samples."""
-    program = live.programs[0]
-    tile = program.resting(lane)
-    update, nothing = program.drivers().updater(tile, program.model.m), one_or_all(np.full(program.model.m, np.nan))
-    lane = state_of(tile)
-    for k in range(points.shape[1]):
-        update(as_compiled(tile), np.nan, nothing)
-        spread(lane["theta"], live.tracker.cov(lane), c, k, points)

@@ -219,7 +219,11 @@ class Alarms(Printed):
                 "Samples",
                 f"none is judged: the run has {len(self.active)}, and the first {self.start} do not count",
             ),
-            *self._not_judged(),
+            *(
+                [("Not judged", f"{self.unseen} samples: a regressor moves that did not in the reference, or hardly")]
+                if self.unseen
+                else []
+            ),
             ("Alarms", f"{len(self.onsets)}"),
             *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
@@ -229,11 +233,6 @@ class Alarms(Printed):
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
-
-    def _not_judged(self) -> list[tuple[str, str]]:
-        """The line on the samples that are unlike all of the reference, if there are some."""
-        why = f"{self.unseen} samples: a regressor moves that did not in the reference, or hardly"
-        return [("Not judged", why)] if self.unseen else []
 
     def _real_rate(self) -> list[tuple[str, str]]:
         """The line on the real rate, if it may be far above the one that is set."""

@@ -13,6 +13,7 @@ Source: Bai and Perron (1998); Yao (1987) for the likelihood of a date; White (1
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -204,8 +205,11 @@ def dated(
         spans[k] = min(inside[0], breaks[k]), max(inside[1], breaks[k])
         theta = theta @ model.basis.T
         moved[k : k + 2] += np.einsum("m,mkj->kj", weight, (theta - np.einsum("m,mkj->kj", weight, theta)) ** 2)
-    certain = _certain(np.append(0, breaks), np.vstack([[[0, 0]], spans]), N, n)
-    found = [informed(model.phi[first:last]) for first, last in certain] if K else []
+    found = []
+    for k, (start, stop) in enumerate(pairwise([0, *breaks, N]) if K else ()):  # rows that certainly belong to it
+        sure = spans[k - 1, 1] if k else 0, spans[k, 0] if k < K else N
+        low, high = sure if sure[1] - sure[0] > n else (start, stop)  # or all of a segment that has too few of them
+        found.append(informed(model.phi[low:high]))
     later = zip(np.split(split(X, breaks), K + 1, axis=1)[1:], found[1:], strict=True)
     rows = np.hstack([X, *(part @ _projector(model, directions) for part, (_, directions) in later)])
     theta, left = estimated(X, y, parts, breaks, rows)
@@ -230,16 +234,6 @@ def _errors(model: Model, rows: Array, parts: tuple[Array, Array, Array], moved:
     total = np.kron(np.tril(np.ones((K + 1, K + 1))), model.basis)
     own = np.einsum("ij,jk,ik->i", total, V, total).reshape(K + 1, n)
     return np.asarray(np.sqrt(np.maximum(own + moved, 0.0)))
-
-
-def _certain(starts: Array, spans: Array, N: int, n: int) -> list[tuple[int, int]]:
-    """Rows that certainly belong to the segments from ``starts`` on, or all of a segment that has too few of them."""
-    found = []
-    for k, start in enumerate(starts):
-        stop = int(starts[k + 1]) if k + 1 < len(starts) else N
-        sure = int(spans[k, 1]), int(spans[k + 1, 0]) if k + 1 < len(starts) else N
-        found.append(sure if sure[1] - sure[0] > n else (int(start), stop))
-    return found
 
 
 COMPONENT = 1e-6

@@ -149,11 +149,11 @@ class Draws:
     constants: tuple[Array, Array]
     """theta and its autoregression, less their bias."""
 
-    def __init__(self, model: Model, problem: Problem, held: Array, seed: int = 0) -> None:
+    def __init__(self, model: Model, problem: Problem, held: Array) -> None:
         N, n = model.X.shape
         self.model, self.problem, self.e = model, problem, held
         self.work, self.found = Work.of(N, n, problem), Found.of(n, problem)
-        self.rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng(0)
 
     def of(self, theta: Array, ar: Array, count: int, whole: bool) -> Results:
         """Draws from constants theta (n,) in units of the model; only constants of them unless ``whole``."""

@@ -312,31 +312,15 @@ def _selected(
     tracker: Tracker,
     search: tuple[Sequence[str], int | None] | None,
 ) -> Selection:
-    """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
+    """Rank structures on the samples that all could predict, or with ``search`` = (keep, most) subsets of the
+    regressors of the first.
+    """
     if search is None:
-        return _judged(pool, tracker, structures, pool.predict(tracker, structures))
-    if structures[0].n > MOST:
+        predictions = pool.predict(tracker, structures)
+    elif structures[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {structures[0].n}.")
-    structures, predictions = subsets(pool, tracker, structures[0], *search)
-    return _judged(pool, tracker, structures, predictions)
-
-
-def _bound(models: Sequence[Model], records: Records) -> list[Model]:
-    """The candidates for the inputs of the records; an ARX model of a grid with nb = 0 has no inputs."""
-    inputs, m, bound = records.labels.u, records.u.shape[-1], []
-    for model in models:
-        if inputs and model.input_names not in ((), tuple(inputs)):
-            raise ValueError(
-                f"select: all candidates must name the same inputs in the same order; {model!r} does not have "
-                f"{', '.join(inputs)}."
-            )
-        whole = replace(model, inputs=m) if isinstance(model, ARX) and model.inputs == 0 and m > 0 else model
-        bound.append(whole.bind(inputs or m))
-    return bound
-
-
-def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictions: list[Predicted]) -> Selection:
-    """Rank structures on the samples that all could predict."""
+    else:
+        structures, predictions = subsets(pool, tracker, structures[0], *search)
     y, starts = pool.y, pool.starts(max(s.n for s in structures))
     judged = pool.after(starts)
     for prediction in predictions:
@@ -355,3 +339,17 @@ def _judged(pool: Pool, tracker: Tracker, structures: list[Candidate], predictio
         rows.append(Row(structure.name, structure.n, float(total), float(totals[top] - total), spread, rms))
     rows.sort(key=lambda row: -row.loglik)
     return Selection(tuple(rows), count, tracker, pool, tuple(structures), tuple(predictions), judged)
+
+
+def _bound(models: Sequence[Model], records: Records) -> list[Model]:
+    """The candidates for the inputs of the records; an ARX model of a grid with nb = 0 has no inputs."""
+    inputs, m, bound = records.labels.u, records.u.shape[-1], []
+    for model in models:
+        if inputs and model.input_names not in ((), tuple(inputs)):
+            raise ValueError(
+                f"select: all candidates must name the same inputs in the same order; {model!r} does not have "
+                f"{', '.join(inputs)}."
+            )
+        whole = replace(model, inputs=m) if isinstance(model, ARX) and model.inputs == 0 and m > 0 else model
+        bound.append(whole.bind(inputs or m))
+    return bound

@@ -97,8 +97,7 @@ def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
 def moved(rows: Array, time: float) -> Array:
     """Rows on x at the first sample expressed as rows on x ``time`` later, without drift."""
     n = rows.shape[1] // 2
-    later: Array = np.hstack([rows[:, :n], rows[:, n:] - time * rows[:, :n]])
-    return later
+    return np.asarray(np.hstack([rows[:, :n], rows[:, n:] - time * rows[:, :n]]))
 
 
 def undetermined(natural: Array, time: Array) -> Array:
@@ -107,8 +106,7 @@ def undetermined(natural: Array, time: Array) -> Array:
     first, second = natural[:, :n], natural[:, n:]
     level = np.linalg.norm(first + time[:, None, None] * second, axis=1) / np.hypot(1.0, time)[:, None]
     slope = np.broadcast_to(np.linalg.norm(second, axis=0), level.shape)
-    unknown: Array = np.hstack([level, slope]) > 1e-8
-    return unknown
+    return np.asarray(np.hstack([level, slope]) > 1e-8)
 
 
 @Driver

@@ -99,8 +99,7 @@ def filter_both(pair: Array, walk: Walk, rows: Array, values: Array, blocks: Arr
 
 def _weighted(walk: Walk) -> Array:
     """sqrt(w) phi and sqrt(w) y, (T, n + 1)."""
-    samples: Array = np.sqrt(walk.weight)[:, None] * np.column_stack([walk.phi, walk.y])
-    return samples
+    return np.asarray(np.sqrt(walk.weight)[:, None] * np.column_stack([walk.phi, walk.y]))
 
 
 def _changes(walk: Walk) -> tuple[Array, Array]:
@@ -128,14 +127,12 @@ def start(walk: Walk, scale: Array, unseen: Array) -> Start:
 
 def unspanned(unseen: Array, scale: Array) -> Array:
     """Orthonormal basis, in rows, of the directions of theta without information, from those of scaled regressors."""
-    basis: Array = np.linalg.qr(unseen / scale[:, None])[0].T
-    return basis
+    return np.asarray(np.linalg.qr(unseen / scale[:, None])[0].T)
 
 
 def undetermined(hidden: Array) -> Array:
     """Which parameters have a component in undetermined directions."""
-    share: Array = np.linalg.norm(hidden, axis=0) > 1e-8
-    return share
+    return np.asarray(np.linalg.norm(hidden, axis=0) > 1e-8)
 
 
 def gains(walk: Walk, G: Array, blocks: Array) -> Array:

@@ -99,8 +99,7 @@ class Walk(NamedTuple):
 
     def residual(self, theta: Array) -> Array:
         """y - phi' theta, (T,)."""
-        residual: Array = self.y - np.einsum("ti,ti->t", self.phi, theta)
-        return residual
+        return np.asarray(self.y - np.einsum("ti,ti->t", self.phi, theta))
 
     def pull(self, residual: Array) -> Array:
         """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the gradient of each increment.
@@ -108,8 +107,7 @@ class Walk(NamedTuple):
         At the minimum of J its first row is zero (without a prior), and `moves` converts it to the increments.
         """
         weighted = self.phi * (self.weight * residual)[:, None]
-        forces: Array = np.cumsum(weighted[::-1], axis=0)[::-1]
-        return forces
+        return np.asarray(np.cumsum(weighted[::-1], axis=0)[::-1])
 
     def moves(self, pull: Array) -> Array:
         """theta_{t+1} - theta_t from gradients (T, n) of `pull`: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
@@ -119,8 +117,7 @@ class Walk(NamedTuple):
         if len(self.trend):
             pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
         drift_root = self.drift_root[1:] if len(self.drift_root) else 1.0
-        moves: Array = self.drift[1:, None] * drift_root * ((drift_root * pull[1:]) @ self.q)
-        return moves
+        return np.asarray(self.drift[1:, None] * drift_root * ((drift_root * pull[1:]) @ self.q))
 
 
 def room_for_signals(T: int, n: int) -> Array:
