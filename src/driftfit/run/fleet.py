@@ -13,7 +13,6 @@ that the joint run used, with all methods of a Track.
 from __future__ import annotations
 
 import os
-import warnings
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, KeysView, Mapping, Sequence
 from dataclasses import replace
@@ -378,7 +377,11 @@ class Fleet(KeyedResults):
             return self._whole(self._series[key])
         if key in self._index:
             return self._run(self._index[key])
-        raise KeyError(self._absent(key))
+        if key in self.failed:
+            raise KeyError(f"{key!r} has no result: {self.failed[key]}")
+        some = ", ".join(repr(k) for k in list(self._index)[:5])
+        more = ", ..." if len(self) > 5 else ""
+        raise KeyError(f"the fleet has no {key!r}; it has {len(self)} keys: {some}{more}")
 
     def __contains__(self, key: object) -> bool:
         return key in self._index or key in self._series
@@ -410,12 +413,6 @@ class Fleet(KeyedResults):
             return self._whole(k)[output]  # type: ignore[index]
         left_out = self.records.left_out.get(self.records.keys[j], NOTHING_LEFT_OUT)
         return Track(self.programs[j], self.records.part(j), self._lanes[j], self._starts.get(j), left_out)
-
-    def _absent(self, key: Hashable) -> str:
-        if key in self.failed:
-            return f"{key!r} has no result: {self.failed[key]}"
-        some = ", ".join(repr(k) for k in list(self._index)[:5])
-        return f"the fleet has no {key!r}; it has {len(self)} keys: {some}{', ...' if len(self) > 5 else ''}"
 
     def __repr__(self) -> str:
         samples = sum(int(self.records.length[k]) for k in self._series.values())
@@ -451,9 +448,9 @@ def run_fleet(
     series = zip(records.keys, done, strict=True)
     absent = {key: "interrupted before it was run" for key, finished in series if not finished}
     if absent:
-        warnings.warn(
+        warn(
             f"interrupted: {sum(done)} of {len(done)} series are finished; the others are listed in fleet.failed.",
-            stacklevel=3,
+            UserWarning,
         )
     return Fleet(programs, records, lanes, {**(failed or {}), **absent}, starts)
 

@@ -277,15 +277,9 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
             found[name] += values
             linear &= run.model.hidden is None and not (run.model.implicit or run.program.settling)
     if found:
-        warn(f"{verb}: {_ungated(found, linear)}")
-
-
-def _ungated(found: Mapping[str, Sequence[float]], linear: bool) -> str:
-    """What is warned of after a run without a gate, given the values of each signal that look like codes, and whether
-    the model is linear in theta."""
-    said = "; ".join(_named(name, values) for name, values in found.items())
-    lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
-    return f"{said}. Such readings enter the estimate; gate=True leaves them out.{lasting}"
+        said = "; ".join(_named(name, values) for name, values in found.items())
+        lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
+        warn(f"{verb}: {said}. Such readings enter the estimate; gate=True leaves them out.{lasting}")
 
 
 def _named(name: str, values: Sequence[float]) -> str:

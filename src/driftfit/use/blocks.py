@@ -28,7 +28,6 @@ free run predicts better than the one-step prediction, which feeds noisy outputs
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -37,7 +36,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of, whole
+from driftfit.engine.settings import one_of, warn, whole
 from driftfit.models.hammerstein_wiener.blocks import Blocks, deviations
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.output_curve import Inverse
@@ -92,10 +91,9 @@ def _warn(found: Blocks, run: Track, theta: Array, input: str | None) -> None:
     """Warn of separations that are not reliable."""
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
-        warnings.warn(
+        warn(
             f"blocks: {used} usable samples cannot determine {n} products; the blocks are mostly the initial values.",
             UserWarning,
-            stacklevel=4,
         )
     late = slice(min(len(found) // 2, 5 * run.model.n), None)
     minimal = found.gauged[0] == "c1"
@@ -106,21 +104,19 @@ def _warn(found: Blocks, run: Track, theta: Array, input: str | None) -> None:
         head = np.divide(np.abs(group[late, 0]), size, out=np.full(len(size), np.nan), where=size > 0.0)
         usual = float(np.nanmedian(head)) if np.isfinite(head).any() else 1.0
         if usual < WEAK:
-            warnings.warn(
+            warn(
                 f"blocks: {name} = 1 is a bad gauge here, the other coefficients are {1.0 / usual:.3g} times as large; "
                 f"order the functions so that the first matters, or {way}.",
                 UserWarning,
-                stacklevel=4,
             )
     if found.method == "average" and found.c.shape[1] > 1:
         near = np.abs(theta[late, found.a.shape[1] : found.a.shape[1] + found.b.shape[1]])
         small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
         if small.any():
-            warnings.warn(
+            warn(
                 f'blocks: a b_j is close to zero in {int(small.any(axis=1).sum())} samples, where "average" has '
                 'spikes; use "svd-joint".',
                 UserWarning,
-                stacklevel=4,
             )
 
 

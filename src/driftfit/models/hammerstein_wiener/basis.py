@@ -18,7 +18,6 @@ should use `Legendre` on the range of the data. B-splines are undefined outside 
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -30,7 +29,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver, kernel
-from driftfit.engine.settings import Settings, numbers, place_of, whole
+from driftfit.engine.settings import Settings, numbers, place_of, warn, whole
 from driftfit.models.hammerstein_wiener import curve_kernels
 
 
@@ -198,11 +197,10 @@ class Polynomial(Basis):
     def __post_init__(self) -> None:
         self._set("degree", whole("Polynomial", "degree", self.degree, 1))
         if self.degree > 3:
-            warnings.warn(
+            warn(
                 f"Polynomial({self.degree}): powers beyond 3 are nearly collinear, and estimates suffer; "
                 f"use Legendre({self.degree}, (low, high)) on the range of the data.",
                 UserWarning,
-                stacklevel=3,
             )
 
     @property

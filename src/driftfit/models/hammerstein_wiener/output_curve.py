@@ -218,21 +218,15 @@ def refining(out: Kind) -> Any:
 
 
 @lru_cache
-def inverse_of(out: Kind) -> Any:
-    """A part (m, p, right) that inverts the output block."""
+def inverting(out: Kind) -> Any:
+    """A core (m, p, right) that inverts the output block, where it is seldom needed."""
     refine = refining(out)
 
     def invert(m: Array, p: Places, right: float) -> Any:
         found = locate(m, p, right)
         return refine(m, p, found) if m[NUMBER.late, 0] > 0.0 else found
 
-    return part(invert)
-
-
-@lru_cache
-def inverting(out: Kind) -> Any:
-    """The same as a core, where it is seldom needed."""
-    return shared(inverse_of(out).py_func)
+    return shared(invert)
 
 
 @lru_cache

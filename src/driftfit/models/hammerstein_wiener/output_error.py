@@ -34,7 +34,7 @@ from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.output_curve import Kind, inverse_of, level, rises, values_of
+from driftfit.models.hammerstein_wiener.output_curve import Kind, inverting, level, rises, values_of
 from driftfit.models.hammerstein_wiener.structure import AT, GRID, INPUT, NUMBER, Places, room
 from driftfit.trackers.forms.covariance import LEFT
 
@@ -225,7 +225,7 @@ def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
     n_out, d, free, g, h = p[AT.n_out], p[AT.d_now], p[AT.x_d], p[AT.trial], p[AT.trial_bend]
     n_x = free + n_out - 1 + intercept
     N, follow = n_w + n_x, _following(p)
-    fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), shared(inverse_of(out).py_func)
+    fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), inverting(out)
 
     @kernel
     def forecast(s: State, l: int) -> None:
@@ -330,13 +330,13 @@ class OutputError(Minimal):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("OutputError", model)
-        n_w = max(structure.na, 1)
+        n_w, state = max(structure.na, 1), self.state(structure.n_x)
         N = n_w + structure.n_x
         assert isinstance(model, HammersteinWiener)
         S = np.zeros((N, N))
-        S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
+        S[n_w:, n_w:] = state["P"]
         return {
-            **self.state(structure.n_x), "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
+            **state, "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
             "scratch": np.zeros((2, N)), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0,
             "least_slope": SLOPE_SHARE * model.out.steepness, "v_power": np.zeros(model.m),
         }  # fmt: skip

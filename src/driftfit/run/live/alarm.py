@@ -171,16 +171,11 @@ class LiveAlarm:
             samples[:, : phi.shape[1]] = phi
         for place, name in enumerate(ROW, len(rule.parameters)):
             samples[:, place] = known[name]
-        self._draw(samples)
+        n = len(rule.parameters)
+        samples[:, n + Y] = rule.drawn(samples[:, :n], samples[:, n + Y], samples[:, n + NOISE_FACTOR], self._judged)
+        self._judged += T
         scan(samples, self._frozen, self._memory, findings, np.zeros(T, np.int8))
         return findings[:, : len(rule.names)], findings
-
-    def _draw(self, rows: Array) -> None:
-        """Draw readings of a coarse sensor again within their step."""
-        n = len(self.rule.parameters)
-        noise = rows[:, n + NOISE_FACTOR]
-        rows[:, n + Y] = self.rule.drawn(rows[:, :n], rows[:, n + Y], noise, self._judged)
-        self._judged += len(rows)
 
     def plain(self) -> dict[str, Any]:
         """The state as plain data."""

@@ -20,7 +20,6 @@ Cost per sample: a few operations.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from math import exp, isfinite
 from statistics import NormalDist
@@ -28,6 +27,7 @@ from statistics import NormalDist
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 
 STEP = 0.05
 """Change of log f for one output outside its band: the rest of the change is alpha times as large, down."""
@@ -97,10 +97,10 @@ def widened(e: Array, s: Array, level: float, name: str) -> Array:
     found = factors(e, s, level)
     if found.max() > WARNED_FACTOR:
         t = int(np.argmax(found > WARNED_FACTOR))
-        warnings.warn(
+        warn(
             f"{name}: outputs are outside their {level:.0%} bands so often that the bands are widened by a factor "
             f"above {WARNED_FACTOR:g} after {t} samples, and up to {found.max():.1f}: the model or the noise is not "
             "what the tracker assumes; run.diagnose() shows which.",
-            stacklevel=3,
+            UserWarning,
         )
     return found

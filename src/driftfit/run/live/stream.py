@@ -288,19 +288,16 @@ class Stream(Plain, storage.Kept):
                 "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once "
                 "per sample."
             )
-        self._put(self._tile, self._within(self.inputs_of(u)))
+        inputs = self.inputs_of(u)
+        if self._limits is not None and self._awaits == INPUT:
+            inputs = self._limits.sample(np.full(len(self.model.outputs), np.nan), inputs)[1]
+        self._put(self._tile, inputs)
         self._expect(NOTHING)
 
     def _put(self, tile: Array, inputs: Array) -> None:
         """Store the outstanding input in a tile."""
         if self._awaits == INPUT:
             self._placing()(as_compiled(tile), inputs)
-
-    def _within(self, inputs: Array) -> Array:
-        """Inputs with NaN outside their limits, which are counted."""
-        if self._limits is None or self._awaits != INPUT:
-            return inputs
-        return self._limits.sample(np.full(len(self.model.outputs), np.nan), inputs)[1]
 
     @property
     def awaits(self) -> bool:
