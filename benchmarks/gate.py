@@ -3,6 +3,7 @@
     python -m benchmarks.gate                 # the table of cases
     python -m benchmarks.gate --rules         # what leaving out each rule costs
     python -m benchmarks.gate --runs 20 --only jump,code
+    python -m benchmarks.gate --quick         # one record of each
 
 Columns of a case, for each tracker: good readings refused and codes let in (the most of all records), and the error of
 theta (root mean square from 20 samples after the event on, median over records) as a multiple of that of the same
@@ -309,14 +310,16 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--only", default="")
     parser.add_argument("--rules", action="store_true")
+    parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
+    runs = 1 if given.quick else given.runs
     words = given.only.split(",")
     cases = {k: v for k, v in (REAL | CODES | STARTS).items() if any(word in k for word in words)}
     if given.rules:
-        return ablation(cases, given.runs, RULES)
+        return ablation(cases, runs, RULES)
     benches = {name: Bench(*sizes, Gate()) for name, sizes in MODELS.items()}
     print(" " * 32, " | ".join(f"{name:>8}: lost in gated   ungated" for name in NAMES))
-    table(benches, cases, given.runs)
+    table(benches, cases, runs)
     return None
 
 

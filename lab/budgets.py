@@ -28,15 +28,15 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_685,
-    "statements": 43_252,
-    "modules": 326,
+    "lines of the library": 66_928,
+    "statements": 43_471,
+    "modules": 325,
     "levels of folders": 2,
-    "constants of modules with numbers": 621,
-    "numbers in the source": 2_358,
+    "constants of modules with numbers": 615,
+    "numbers in the source": 2_336,
     "private names of Numba and llvmlite": 27,
     "modules that the Kalman filter imports": 24,
-    "lines of them": 5_143,
+    "lines of them": 5_138,
     "modules that detection imports": 93,
     "modules that a second call of track passes": 9,
     "members of Tracker": 38,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 31,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 11_832,
-    "lines of tests": 32_684,
+    "lines of tests": 32_987,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 

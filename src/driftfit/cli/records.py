@@ -398,6 +398,14 @@ def identify_command(
             typer.echo(text := f"driftfit: this record cannot answer: {error}", err=True)
             written(document("No answer", [opening([text])]), page)
             raise typer.Exit(3) from None
+    _tell(found, page, json_to, serve)
+    if str(json_to) != "-":
+        say(" ".join(found.headline.split()) if quiet else found, soft_wrap=quiet)
+    raise typer.Exit(found.code)
+
+
+def _tell(found: Any, page: Path | None, json_to: Path | None, serve: Path | None) -> None:
+    """Write an answer to what was asked for."""
     if page is not None:
         found.page(page)
     if serve is not None:
@@ -405,6 +413,3 @@ def identify_command(
     if json_to is not None:
         text = json.dumps(found.json(), indent=1)
         typer.echo(text) if str(json_to) == "-" else json_to.write_text(text, encoding="utf-8")
-    if str(json_to) != "-":
-        say(" ".join(found.headline.split()) if quiet else found, soft_wrap=quiet)
-    raise typer.Exit(found.code)

@@ -33,7 +33,7 @@ from driftfit.readings.gate import Gate
 from driftfit.run.program import Program, State
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
-from driftfit.use.planning import plan, room, spread_of_state, terms_of
+from driftfit.use.control import plan, room, spread_of_state, terms_of
 
 FACTORS = ("interval", "noise", "drift")
 """Fields that describe the next sample."""
@@ -140,7 +140,7 @@ def translation(program: Program, fixed_rate: bool = False, horizon: int | None 
 
 
 def _planning(program: Program, unit: Unit, h: int) -> Planning:
-    """Translate `driftfit.use.planning`; everything that is chosen on the controller is a field of the structure."""
+    """Translate `driftfit.use.control`; everything that is chosen on the controller is a field of the structure."""
     model: Any = program.model
     m, own = model.m, room(model, program.tracker, h)
     shapes: dict[str, tuple[int, ...]] = {
