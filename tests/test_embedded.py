@@ -5,12 +5,12 @@ import re
 import runpy
 import shutil
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from contract_table import forms, ready
+from embedded_support import STRICT, Exported, agree, bits, needs_gcc, same_numbers
 from typer.testing import CliRunner
 
 from driftfit import (
@@ -33,17 +33,11 @@ from driftfit import (
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
 from driftfit.embedded.project import record, translation
-from driftfit.embedded.values import TranslationError
-from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import kernel
-from driftfit.trackers.base import Tracker
 
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off"]
 ROOT = Path(__file__).parent.parent
 CORTEX = ROOT / "tests" / "cortex"
 M4F = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
 
-needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc to compile the source")
 needs_controller = pytest.mark.skipif(
     shutil.which("arm-none-eabi-gcc") is None or shutil.which("qemu-system-arm") is None,
     reason="there is no arm-none-eabi-gcc or no qemu-system-arm",
@@ -68,72 +62,6 @@ OTHERS = {
     "default, volatility": (ARX(1, 1), AdaptiveKalman(volatility=0.01)),
     "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }
-
-
-class Step(ctypes.Structure):
-    """tracker_step."""
-
-    _fields_ = [*((name, ctypes.c_double) for name in ("y_hat", "e", "variance")), ("ok", ctypes.c_int)]
-
-
-class Exported:
-    """The tracker in a shared library, with a state of its own."""
-
-    def __init__(self, folder, live, **options):
-        target = folder / "tracker.so"
-        command = ["gcc", *STRICT, "-O2", "-shared", "-fPIC", "-o", str(target), str(folder / "tracker.c"), "-lm"]
-        subprocess.run(command, check=True)
-        self.library = ctypes.CDLL(str(target))
-        for name in ("tracker_update", "tracker_predict"):
-            getattr(self.library, name).restype = Step
-        self.size = len(to_struct(live, **options))
-        self.buffer, self.scratch = ctypes.create_string_buffer(self.size), ctypes.create_string_buffer(self.size)
-        self.library.tracker_init(self.buffer)
-
-    def update(self, y, u):
-        u = np.ascontiguousarray(u, dtype=float)
-        return tuple_of(self.library.tracker_update(self.buffer, ctypes.c_double(y), ctypes.c_void_p(u.ctypes.data)))
-
-    def predict(self, u):
-        u = np.ascontiguousarray(u, dtype=float)
-        return tuple_of(self.library.tracker_predict(self.buffer, self.scratch, ctypes.c_void_p(u.ctypes.data)))
-
-    @property
-    def state(self):
-        return self.buffer.raw
-
-
-def tuple_of(step):
-    return [step.y_hat, step.e, step.variance, float(step.ok)]
-
-
-def bits(values):
-    return np.asarray(values, dtype=float).view(np.int64).tolist()
-
-
-def same_numbers(one, other):
-    """Bit for bit, but for the sign and payload of NaN, which processors choose."""
-    one, other = (np.frombuffer(state, dtype=np.int64) for state in (one, other))
-    nan = np.isnan(one.view(float)) & np.isnan(other.view(float))
-    return bool(np.all((one == other) | nan))
-
-
-def agree(folder, model, tracker, T, gate=None, **options):
-    """Run both over a record with holes, an outage and inputs that fall silent, and compare every step and state."""
-    export_c(model, tracker, folder, gate=gate, **options)
-    live = Live(model, tracker, gate=gate)
-    ours = Exported(folder, live, **options)
-    assert same_numbers(ours.state, to_struct(live, **options))
-    y, u = record(live.model, T, seed=3, codes=bool(gate))
-    u[2 * T // 5 : 3 * T // 5] = 0.0
-    steps, found = np.empty((T, 4)), np.empty((T, 4))
-    for t in range(T):
-        steps[t] = live.update(float(y[t]), u[t, : live.model.m])
-        found[t] = ours.update(float(y[t]), u[t])
-        assert t % 97 or same_numbers(ours.state, to_struct(live, **options)), t
-    np.testing.assert_array_equal(found, steps)
-    assert 0.5 * T < steps[:, 3].sum() < T
-    return live, ours
 
 
 @needs_gcc
@@ -355,59 +283,7 @@ def test_an_export_that_is_not_possible_is_refused(tmp_path):
         export_c(Regression(1), Kalman(q=1e-3, r=0.1), tmp_path, horizon=8)
     with pytest.raises(ValueError, match="q"):
         export_c(ARX(1, 1), Kalman(), tmp_path)
-    with pytest.raises(TranslationError, match=r"correct: no translation of `np.tanh"):
-        export_c(Regression(1), Odd(), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-@kernel
-def slope_of(e):
-    if abs(e) > 1.0:
-        return 1.0 / abs(e)
-    return 1.0
-
-
-@kernel
-def descend(s, l):
-    y_hat, power = 0.0, 1e-3
-    for i in range(s.phi.shape[0]):
-        y_hat += s.phi[i, l] * s.theta[i, l]
-        power += s.phi[i, l] ** 2
-    s.y_hat[l], s.e[l], s.s[l] = y_hat, s.y[l] - y_hat, s.r[l]
-    some = 1
-    for i in range(s.phi.shape[0]):
-        some = some if s.phi[i, l] == 0.0 else 3
-        s.theta[i, l] += s.ok[l] * s.rate[l] * some * slope_of(s.e[l]) * s.e[l] * s.phi[i, l] / power
-    s.leaks[l] += some - 1
-    some = 2
-    s.turns[l] += some
-    s.rate[l] *= 1.0 if s.noise[l] < 2.0 else 0.5
-
-
-@kernel
-def unknown_variance(s, l):
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = np.nan
-
-
-@kernel
-def still(s, l):
-    """Nothing changes with time."""
-
-
-@dataclass(frozen=True)
-class Descent(Tracker):
-    """A tracker of one's own: normalised gradient steps with bounded errors."""
-
-    rate: float = 0.1
-    covariance = False
-
-    def state(self, n):
-        return {"theta": np.zeros(n), "rate": self.rate, "r": 1.0, "leaks": 0, "turns": 0}
-
-    @property
-    def steps(self):
-        return TrackerSteps(still, still, descend, unknown_variance, still)
 
 
 WICKED = "*/ int evil; /*", "a\n*/ int evil(void); //", "**//int evil;", "\u202e`](x) <b>", "x??/\\", '"; evil'
@@ -427,70 +303,6 @@ def test_names_of_signals_are_no_code(tmp_path):
     assert title.count("`") == 2
 
 
-@kernel
-def follow(s, l):
-    μ = s.θ[l] * s.float[l]
-    for i in range(s.phi.shape[0]):
-        s.theta[i, l] += s.ok[l] * μ * s.phi[i, l] * s.y[l]
-    s.y_hat[l], s.e[l], s.s[l] = μ, s.y[l] - μ, 1.0
-    s.float[l] *= 0.5
-
-
-@dataclass(frozen=True)
-class Letters(Tracker):
-    """Names that Python knows and C does not; */ int evil; /*"""
-
-    covariance = False
-
-    def state(self, n):
-        return {"theta": np.zeros(n), "θ": 0.5, "float": 0.25}
-
-    @property
-    def steps(self):
-        return TrackerSteps(still, still, follow, unknown_variance, still)
-
-
-@needs_gcc
-def test_names_that_c_does_not_know_are_written_in_its_letters(tmp_path):
-    agree(tmp_path, Regression(1), Letters(), 200)
-    assert (tmp_path / "tracker.c").read_text().isascii()
-
-
-@needs_gcc
-def test_a_tracker_of_ones_own_is_exported_like_any_other(tmp_path):
-    live, ours = agree(tmp_path, ARX(2, 2), Descent(rate=0.1), 1_000)
-    assert "r" not in [name for name in re.findall(r"tracker_real (\w+);", (tmp_path / "tracker.h").read_text())]
-    live.lane()["noise"][...] = 4.0
-    ctypes.memmove(ours.buffer, to_struct(live), ours.size)
-    assert bits(live.update(0.5, 0.3)) == bits(ours.update(0.5, [0.3]))
-    assert same_numbers(ours.state, to_struct(live))
-
-
-@kernel
-def correct(s, l):
-    s.y_hat[l] = s.phi[0, l] * s.theta[0, l]
-    s.e[l] = s.y[l] - s.y_hat[l]
-    s.s[l] = 1.0
-    s.theta[0, l] += s.ok[l] * 0.1 * np.tanh(s.e[l]) * s.phi[0, l]
-
-
-@kernel
-def predict(s, l):
-    s.var[0, l] = 1.0
-
-
-@dataclass(frozen=True)
-class Odd(Tracker):
-    """A tracker of one's own that calls what C has no bits for."""
-
-    def state(self, n):
-        return {"theta": np.zeros(n)}
-
-    @property
-    def steps(self):
-        return TrackerSteps(predict, still, correct, predict, still)
-
-
 @needs_gcc
 def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["controller.py"])
@@ -503,19 +315,9 @@ def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
 def test_the_command_writes_the_same(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-4, r=0.1), tmp_path / "one", horizon=4)
     words = [
-        "--horizon",
-        "4",
-        "--model",
-        "arx:2,2",
-        "--tracker",
-        "kalman",
-        "-p",
-        "q=1e-4",
-        "-p",
-        "r=0.1",
-        "--out",
-        str(tmp_path / "two"),
-    ]
+        "--horizon", "4", "--model", "arx:2,2", "--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.1",
+        "--out", str(tmp_path / "two"),
+    ]  # fmt: skip
     assert CliRunner().invoke(app, ["export", "c", *words]).exit_code == 0
     for path in (tmp_path / "one").iterdir():
         assert path.read_text() == (tmp_path / "two" / path.name).read_text()
