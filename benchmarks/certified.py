@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import numpy as np
 import statsmodels.api as sm
 from nist import DATA, digits
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -38,7 +39,7 @@ def tracked(tracker: Tracker, y: Any, X: Any) -> Any:
 def main() -> None:
     quick = "--quick" in sys.argv
     columns = [name for name in COLUMNS if not (quick and name.startswith("FLS"))]
-    table = Table("data set", *columns)
+    table = Table("data set", *columns, box=SIMPLE_HEAD, show_edge=False)
     for name, (y, X, certified, _) in list(DATA.items())[: 1 if quick else None]:
         order = [X.shape[1], *range(X.shape[1])]  # the constant first, as theirs
         found = {one: COLUMNS[one](y, X) for one in columns}

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -208,7 +209,7 @@ def main(quick: Annotated[bool, typer.Option(help="One size, few samples, one tr
             "Kalman, sqrt": Kalman(q=1e-4, r=0.01, p0=1.0, form="sqrt"), "RLS": RLS(0.98), "FLS": FLS(100.0),
             "AdaptiveKalman": AdaptiveKalman(),
         }  # fmt: skip
-    table = Table(title="On a Cortex-M4F, -O2", show_edge=False)
+    table = Table(title="On a Cortex-M4F, -O2", show_edge=False, box=SIMPLE_HEAD)
     numbers = ("state", "code", "instr.", "cycles")
     for head in ("tracker", "n", *numbers, *numbers):
         table.add_column(head, justify="left" if head == "tracker" else "right", no_wrap=True)
@@ -217,13 +218,15 @@ def main(quick: Annotated[bool, typer.Option(help="One size, few samples, one tr
             table.add_row(name, str(n), *state_and_cost(ARX(n // 2, n - n // 2), tracker))
     out.print(table)
     out.print("bytes of state and code, and per update; first in double precision, then in single (-DTRACKER_SINGLE)")
-    ratios = Table(title="\nCycles per update on a Cortex-M4F, compared with filter.c", show_edge=False)
+    ratios = Table(
+        title="\nCycles per update on a Cortex-M4F, compared with filter.c", show_edge=False, box=SIMPLE_HEAD
+    )
     for head in ("n", *("by hand", "Kalman", "ratio", "fixed rate", "ratio") * 2):
         ratios.add_column(head, justify="right", no_wrap=True)
     for n in sizes if quick else range(2, 9):
         ratios.add_row(*against_filter(n))
     out.print(ratios)
-    timed = Table(title="\nOn this computer, compared with filter.c", show_edge=False)
+    timed = Table(title="\nOn this computer, compared with filter.c", show_edge=False, box=SIMPLE_HEAD)
     for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
         timed.add_column(head, justify="right")
     for n in sizes:

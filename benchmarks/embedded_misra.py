@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -49,7 +50,7 @@ def main(quick: Annotated[bool, typer.Option(help="Only the first export.")] = F
         out.print("cppcheck is not installed.")
         return
     version = subprocess.run(["cppcheck", "--version"], capture_output=True, text=True, check=True).stdout.strip()
-    table = Table(title=f"Reports by rule of MISRA C:2012, {version}", show_edge=False)
+    table = Table(title=f"Reports by rule of MISRA C:2012, {version}", show_edge=False, box=SIMPLE_HEAD)
     table.add_column("rule")
     chosen = list(EXPORTED.items())[: 1 if quick else None]
     counts = {name: reported(*settings) for name, settings in chosen}

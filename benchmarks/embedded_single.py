@@ -19,6 +19,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -108,7 +109,7 @@ def of_scaled_outputs(T: int, scales: tuple[float, ...]) -> Table:
     clean, inputs = record(LINEAR.bind(1), T)
     u = np.ascontiguousarray(inputs[:, 0])
     learned = track(model, OutputError(q=1e-3, r=0.1), clean, u).theta[-1]
-    table = Table(title="\nOutputError, predictions / std of y", show_edge=False)
+    table = Table(title="\nOutputError, predictions / std of y", show_edge=False, box=SIMPLE_HEAD)
     for head in ("outputs times", "start", "single - double", "double - double of y (1 + 1e-7)", "error in double"):
         table.add_column(head, justify="left" if head == "start" else "right")
     rng = np.random.default_rng(0)
@@ -133,7 +134,11 @@ def of_scaled_outputs(T: int, scales: tuple[float, ...]) -> Table:
 def main(quick: Annotated[bool, typer.Option(help="Two records of 500 samples, of two trackers.")] = False) -> None:
     """Print both tables."""
     records, T = (2, 500) if quick else (20, 2_000)
-    table = Table(title=f"Single against double precision, the largest of {records} x {T} samples", show_edge=False)
+    table = Table(
+        title=f"Single against double precision, the largest of {records} x {T} samples",
+        show_edge=False,
+        box=SIMPLE_HEAD,
+    )
     table.add_column("tracker")
     for head in ("predictions / std of y", "theta / largest theta", "theta / its std"):
         table.add_column(head, justify="right")

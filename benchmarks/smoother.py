@@ -26,6 +26,7 @@ from time import process_time
 from unittest.mock import patch
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import solveh_banded
@@ -157,7 +158,10 @@ def main(quick: bool) -> None:
     sizes = (1_000, 3_000) if quick else (10_000, 100_000, 1_000_000)
     methods = {"driftfit": ours, "statsmodels": statsmodels, "banded solve, means only": banded}
     table = Table(
-        title=f"Exact smoothing, n = {N}: seconds of processor time, and microseconds a sample", title_justify="left"
+        title=f"Exact smoothing, n = {N}: seconds of processor time, and microseconds a sample",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
     )
     table.add_column("samples", justify="right")
     for name in methods:
@@ -170,7 +174,7 @@ def main(quick: bool) -> None:
         cells = [f"{min(t):.4f} ({min(t) / T * 1e6:.2f})" for t in times.values()]
         ratio = min(times["statsmodels"]) / min(times["driftfit"])
         table.add_row(f"{T:,}", *cells, f"{ratio:.1f}", f"{gap:.0e}")
-    Console(width=120).print(table)
+    Console(width=120).print(table, "")
     memory(sizes[0])
     others(sizes[0], 1 if quick else 60)
     phases(sizes[1], 1 if quick else 20)

@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 import numpy as np
 from naive_smoother import precise
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import LinAlgError, solveh_banded
@@ -52,7 +53,12 @@ def error(found, truth):
 
 
 def main() -> None:
-    table = Table(title="Errors of the smoothed path, and of the standard deviations", title_justify="left")
+    table = Table(
+        title="Errors of the smoothed path, and of the standard deviations",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+    )
     for name in ("regressors", "ratio", "driftfit", "std", "path", "banded", "P0 = 1e7"):
         table.add_column(name, justify="left" if name == "regressors" else "right")
     for name, (phi, y) in records().items():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -48,12 +49,12 @@ def rms(errors: np.ndarray) -> float:
 
 
 def table(title: str, head: list[str], rows: list[list[str]]) -> None:
-    shown = Table(title=title, title_justify="left")
+    shown = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False)
     for i, name in enumerate(head):
         shown.add_column(name, justify="left" if i == 0 else "right")
     for row in rows:
         shown.add_row(*row)
-    Console(width=110, color_system=None).print(shown)
+    Console(width=110, color_system=None).print(shown, "")
 
 
 def lags() -> None:

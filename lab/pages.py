@@ -5,8 +5,9 @@
 
 A text block right after "Printed by `examples/NAME.py`:" is all that this example prints. A text block after
 `python -m lab reproduce NAME` or a benchmark, and before another script is named, is a part of what that script prints,
-unless a Python block precedes it, which prints it. Tables of times, whose titles begin with their unit, and benchmarks
-that read a clock or records that are no part of the project are not compared.
+unless a Python block precedes it, which prints it. A line of three dots stands for rows that are printed and that the
+page leaves out. Tables of times, whose titles begin with their unit, and benchmarks that read a clock or records that
+are no part of the project are not compared.
 """
 
 from __future__ import annotations
@@ -88,17 +89,24 @@ def printed(command: str, quick: bool) -> str:
     return text.getvalue()
 
 
+def pattern(block: str) -> str:
+    """A regular expression of the lines of a block, with any lines in the place of three dots."""
+    return "\n" + re.escape("\n".join([*rows(block), ""])).replace(re.escape("...\n"), r"(?:.*\n)*?")
+
+
 def differences(text: str, blocks: Sequence[str], sample: bool) -> list[str]:
     """Lines of what was printed (+) that no block shows, and unless it is a sample those of a block (-) that were not
     printed, or not in its order.
     """
     lines, parts = rows(text), [rows(block) for block in blocks]
-    more = [f"+ {line}" for line in lines if not any(line in part for part in parts)]
+    whole = "\n".join(["", *lines, ""])
+    found = [re.search(pattern(block), whole) for block in blocks]
+    known = {line for part in parts for line in part} | {line for one in found if one for line in one[0].split("\n")}
+    more = [f"+ {line}" for line in lines if line not in known]
     if sample:
         return more
-    whole = "\n".join(["", *lines, ""])
-    lost = [part for part in parts if "\n".join(["", *part, ""]) not in whole]
-    return more + [f"- {line}" for part in lost for line in ([x for x in part if x not in lines] or part)]
+    lost = [part for part, one in zip(parts, found, strict=True) if not one]
+    return more + [f"- {line}" for part in lost for line in ([x for x in part if x not in [*lines, "..."]] or part)]
 
 
 def compared(command: str, quick: bool = True) -> list[str]:

@@ -85,6 +85,9 @@ def test_a_page_that_no_longer_holds_is_found():
     assert pages.differences("Errors\n a   1.5\n", blocks, sample=True) == []
     assert pages.differences(printed.replace("1.5", "1.6"), blocks, sample=True) == ["+ a 1.6"]
     assert pages.differences(printed.replace(" b   2.5\n", ""), blocks, sample=False) == ["- b 2.5"]
+    cut = ["Errors\n...\n b  2.5\n"]
+    assert pages.differences(printed, cut, sample=False) == []
+    assert pages.differences(printed.replace("2.5", "2.6"), cut, sample=False) == ["+ a 1.5", "+ b 2.6", "- b 2.5"]
     command = ["pages", "--only", "examples/jumps.py"]
     assert CliRunner().invoke(app, command).output == "examples/jumps.py: no differences\n"
 

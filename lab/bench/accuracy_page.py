@@ -36,19 +36,22 @@ def figures(value: float, digits: int = 2) -> str:
 
 
 def table(cells: Sequence[Cell]) -> str:
-    """One scenario, its models side by side; a row that repeats one above is left out."""
-    heads, rows = [""], {name: list[str]() for name in cells[0].scores}
+    """One scenario, its models side by side, without default settings; no row has the errors of one above."""
+    heads, rows = [""], {name: list[str]() for name in cells[0].scores if not name.endswith(", default")}
+    errors = {name: list[str]() for name in rows}
     for cell in cells:
         jumps = ["found", "delay", "false / 1000"] if cell.detections else []
         heads += [f"{cell.kind}: / oracle", "one-step / oracle", "theta in band", "y in band", *jumps]
         for name, row in rows.items():
-            row += [figures(float(np.median(cell.ratio(name, what))), d) for what, d in (("rmse", 2), ("error", 3))]
-            row += [figures(float(np.mean(cell.values(name, what))), 3) for what in ("theta", "y")]
-            row += detection(cell, name) if jumps else []
+            ratios = [figures(float(np.median(cell.ratio(name, what))), d) for what, d in (("rmse", 2), ("error", 3))]
+            shares = [figures(float(np.mean(cell.values(name, what))), 3) for what in ("theta", "y")]
+            found = detection(cell, name) if jumps else []
+            row += ratios + shares + found
+            errors[name] += ratios + found
     shown: dict[tuple[str, ...], str] = {}
-    for name, row in rows.items():
-        shown.setdefault(tuple(row), name)
-    return markdown(heads, [[name, *row] for row, name in shown.items()])
+    for name in rows:
+        shown.setdefault(tuple(errors[name]), name)
+    return markdown(heads, [[name, *rows[name]] for name in shown.values()])
 
 
 def detection(cell: Cell, name: str) -> list[str]:
@@ -100,21 +103,31 @@ def losses(cells: Iterable[Cell]) -> list[tuple[str, str, str, float, float]]:
 
 
 def lost_table(cells: Sequence[Cell]) -> str:
-    """Where and why the tracker without settings is beaten."""
+    """Where and why the tracker without settings is beaten; a row that repeats one of its scenario is left out."""
     lost = losses(cells)
     if not lost:
         return f"Nowhere was a row better than `{REFERENCE}` by 3 % in the median and in three of four runs."
-    rows = [[s, kind, name, f"{ratio:.2f}", f"{100.0 * wins:.0f} %"] for s, kind, name, ratio, wins in lost]
-    causes = [f"* **{name}.** {CAUSES[name]}" for name in dict.fromkeys(s for s, *_ in lost) if name in CAUSES]
-    text = markdown(["scenario", "model", "better", f"RMSE / {REFERENCE}", "runs won"], rows)
-    return "\n\n".join([text, "\n".join(causes)])
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for scenario, kind, name, ratio, wins in lost:
+        rows.setdefault((scenario, kind), {}).setdefault(f"{ratio:.2f} ({100.0 * wins:.0f} %)", name)
+    why: dict[str, list[str]] = {}
+    for name in dict.fromkeys(scenario for scenario, _ in rows if scenario in CAUSES):
+        why.setdefault(CAUSES[name], []).append(name)
+    better = {place: "; ".join(f"{name} {result}" for result, name in row.items()) for place, row in rows.items()}
+    text = markdown(
+        ["scenario", "model", f"better: RMSE / {REFERENCE} (runs won)"], [[*at, row] for at, row in better.items()]
+    )
+    return "\n\n".join([text, "\n".join(f"* **{', '.join(names)}.** {cause}" for cause, names in why.items())])
 
 
 def real_table(result: Result) -> str:
     """One real record."""
-    rows = [[row.name, f"{row.error:.4g}", figures(row.y, 3), f"{row.t:+.1f}"] for row in result.rows]
+    shown: dict[tuple[str, str], list[str]] = {}
+    for row in result.rows:
+        error, t = f"{row.error:.4g}", f"{row.t:+.1f}"
+        shown.setdefault((error, t), [row.name, error, figures(row.y, 3), t])
     title = f"### {result.title} ({result.samples} samples scored)"
-    return f"{title}\n\n{markdown(['', 'one-step error', 'y in band', 't'], rows)}"
+    return f"{title}\n\n{markdown(['', 'one-step error', 'y in band', 't'], [*shown.values()])}"
 
 
 def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], size: Size, absent: Sequence[str]) -> str:
@@ -145,26 +158,31 @@ def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], si
 INTRODUCTION = """\
 Written by `python -m lab bench accuracy --out docs`, which prints every figure.
 
-*RMSE* is the error of the parameters after 200 samples. *Oracle* is the Kalman filter that is given the drift
-covariance and the noise variance of every sample. Ratios to it are computed for each run: tables have the medians of
-RMSE and of the one-step error, pictures the quartiles. A row that repeats one above is left out. In *ramp* and
-*sinusoid* the oracle is given the size of the steps, not that they persist. *In band* gives shares within 95 % bands;
-simulated outliers of y are not counted. *Default* is a package with its default settings, *tuned* uses the setting of
-a grid with the least parameter error on other runs of the same scenario, and *Kalman, hindsight* is the best setting
-on the scored runs themselves. A tracker without default settings has no such row.
+| term | meaning |
+|---|---|
+| *RMSE* | error of the parameters after 200 samples |
+| *oracle* | the Kalman filter that is given the drift covariance and noise variance of every sample |
+| */ oracle* | ratio of errors in each run; tables have the medians, pictures the quartiles |
+| *one-step* | error of the prediction one sample ahead |
+| *in band* | share within 95 % bands, without simulated outliers of y |
+| *default* | a package with its default settings; shown in the next table and in the pictures |
+| *tuned* | the setting of a grid with the least parameter error on other runs of the same scenario |
+| *Kalman, hindsight* | the best setting on the scored runs themselves |
 
-All methods start from zero. Peers receive the regressors, since they do not handle lags, and skip samples with a
-missing lag; `track` fills the lag of a missing output. For jumps, the innovations of every method are passed to the
-same detector, at the threshold that gives one alarm in 1000 samples without drift."""
+In *ramp* and *sinusoid* the oracle is given the size of the steps, not that they persist. All methods start from zero.
+Peers receive the regressors, since they do not handle lags, and skip samples with a missing lag; `track` fills the lag
+of a missing output. For jumps, the same detector reads the innovations of every method, at the threshold that gives one
+alarm in 1000 samples without drift. Tables of scenarios and records leave out a row whose errors are those of a row
+above."""
 
 SAME = """\
-pykalman, simdkalman and dynamax run the filter of `Kalman` when given its settings. `python -m lab bench speed`
-checks that they give the same estimates; their rows would repeat that of `Kalman`, as filterpy's does."""
+pykalman, simdkalman and dynamax run the filter of `Kalman` when given its settings, so their rows would repeat its row;
+`python -m lab bench speed` checks that they give the same estimates."""
 
 REAL = """\
 The first half determines the settings by one-step error, and the second half is scored. *t* is the paired t
-statistic of the differences of squared errors to those of `AdaptiveKalman`: a negative value is a smaller error
-than its own, and values below 2 in size are insignificant."""
+statistic of squared errors less those of `AdaptiveKalman`: negative where a row is better, and insignificant below 2
+in size."""
 
 
 def draw(name: str, cells: Sequence[Cell], T: int) -> Figure:

@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 LEARNED = (
-    "The ratio is learned from the record; the tuned rows have it from other runs of the scenario, hindsight and "
-    "maximum likelihood from these very runs."
+    "`AdaptiveKalman` learns the ratio of drift to noise from the record. The tuned rows have it from other runs of "
+    "the scenario, hindsight and maximum likelihood from these very runs."
 )
 
 CAUSES: dict[str, str] = {
     "no_drift": (
-        "Where nothing changes, least squares is optimal. `AdaptiveKalman` keeps filters that could follow a drift or "
-        "a jump, and distinguishes small ratios from no drift only slowly."
+        "Where nothing changes, least squares is optimal. `AdaptiveKalman` keeps filters that could follow a change, "
+        "and distinguishes a small drift from none only slowly."
     ),
     "sparse_jumps": (
-        "`Bank()` assumes that parameters are constant between jumps. Where they are random walks, or where outliers "
-        "occur for which it has no hypothesis, it is far behind."
+        "`Bank()` assumes that parameters are constant between jumps. It is far behind where they are random walks, or "
+        "where outliers occur."
     ),
     "mixed_rates": (
-        "One parameter changes fast, one slowly, and two are constant, which `AdaptiveKalman` has to learn. Maximum "
-        "likelihood of every drift uses the whole record."
+        "Parameters differ in their drift, which `AdaptiveKalman` has to learn. Maximum likelihood of every drift uses "
+        "the whole record."
     ),
     **dict.fromkeys(("slow_walk", "fast_walk", "missing_data", "lost_excitation", "collinear_inputs"), LEARNED),
 }
 """By scenario."""
 
 REAL_CAUSES = (
-    "On the industry portfolios and the money demand the differences between the trackers that allow drift are "
-    "insignificant; the difference to constant least squares is significant. Trackers with one tuned number are a "
-    "little better where the drift is slow and steady, as in the simulated random walks."
+    "Most trackers that allow drift do not differ significantly. Those with one tuned number are a little better where "
+    "the drift is slow and steady, as in the simulated random walks."
 )
 """Causes of the losses on real records."""
 
