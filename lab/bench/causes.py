@@ -31,8 +31,7 @@ REAL_CAUSES = (
 """Causes of the losses on real records."""
 
 SPEED_CAUSES = (
-    "The first result is where driftfit loses to packages without a compiler: it takes seconds the first time on a "
-    "computer, and half a second after that, half of it for loading Numba. With Numba and LLVM it is also among the "
-    "larger packages to install."
+    "Packages without a compiler have their first result sooner: driftfit takes seconds the first time on a computer, "
+    "and half a second after that. With Numba and LLVM it is also among the larger packages to install."
 )
 """Why a peer is faster, where one is."""

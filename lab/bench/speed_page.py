@@ -24,9 +24,15 @@ Slopes = dict[str, tuple[Array, Array, str]]
 INTRODUCTION = f"""\
 Written by `python -m lab bench speed --out docs`, which prints every figure. Linear algebra uses one thread. The
 compared programs take turns within one process, and figures are medians, so that a busy machine slows all of them.
-*Times ours* above 1 is slower than driftfit, below 1 faster. *Same numbers* is the largest difference of the
-estimates relative to the largest estimate; above {SAME:g} the numbers count as different. "Other" is a different
-algorithm, shown only for its cost."""
+
+| column | meaning |
+|---|---|
+| *times ours* | above 1 slower than driftfit, below 1 faster |
+| *same numbers* | largest difference of the estimates relative to the largest estimate; above {SAME:g} they differ |
+| other | a different algorithm, shown only for its cost |"""
+
+FLOORS, FIXED, BYTES = "Floors", "C, fixed n", "streaming the bytes"
+"""How titles of the contests with the compiled loop begin, and the lines below it."""
 
 OTHERS = "## What a user waits for"
 """From this heading on the page holds what scripts in ``benchmarks/`` print."""
@@ -60,6 +66,18 @@ def section(finish: Finish) -> str:
     if finish.absent:
         parts.append(f"Absent, left out: {', '.join(finish.absent)}.")
     return "\n\n".join(parts)
+
+
+def floors(finishes: Sequence[Finish]) -> str:
+    """The compiled loop, what its arithmetic takes in C, and what its memory takes, in one table."""
+    rows = []
+    for finish in finishes:
+        others = {line.name: line for line in finish.lines[1:]}
+        cells = [duration(others[name].ns) if name in others else "–" for name in (FIXED, BYTES)]
+        ratio = f"{others[FIXED].ratio:.2f}" if FIXED in others else "–"
+        rows.append([finish.title.removeprefix(f"{FLOORS}, "), duration(finish.lines[0].ns), cells[0], ratio, cells[1]])
+    heads = ["", "compiled loop", FIXED, "times ours", BYTES]
+    return f"## {FLOORS}\n\nThe compiled loop alone, including the ARX memory; a step.\n\n{markdown(heads, rows)}"
 
 
 def losses(finishes: Sequence[Finish]) -> list[str]:
@@ -98,7 +116,9 @@ def page(finishes: Sequence[Finish], slopes: Slopes, starts: tuple[Sequence[Star
     if quick:
         parts.append("**Quick form: small sizes, few repeats; not to be quoted.**")
     parts += ["## Where we lose", "\n".join(lost) or "In no contest was a peer faster.", SPEED_CAUSES]
-    parts += [section(finish) for finish in finishes]
+    below = [finish for finish in finishes if finish.lines and finish.title.startswith(FLOORS)]
+    parts += [section(finish) for finish in finishes if finish not in below]
+    parts += [floors(below)] if below else []
     parts += ["## Import, first result, size", FACTORS, start_table(starts)]
     parts += ["## How cost grows", "Slopes on log axes over the larger half of the sizes.", growth_table(slopes)]
     parts += ["![Cost against size, log axes](figures/scoreboard_speed.png)"]
