@@ -1,8 +1,9 @@
 """The build fails when the docs lie.
 
 Python blocks of a page run in order, in one namespace; a text block right after one is what it prints. `lab.pages`
-compares the pages with what examples and reproductions of papers print. Links and pictures must exist. Where an
-optional package is absent, a page is left at the block that imports it, and the test says so.
+compares the pages with what examples and reproductions of papers print. In both, three dots stand for lines that a page
+leaves out. Links and pictures must exist. Where an optional package is absent, a page is left at the block that imports
+it, and the test says so.
 """
 
 import contextlib
@@ -20,12 +21,6 @@ from lab.program import app
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"```(\w*)\n(.*?)```", re.S)
-
-
-def squeezed(text: str) -> list[str]:
-    return [" ".join(line.split()) for line in text.strip().splitlines()]
-
-
 OPTIONAL = {"formulaic", "h5py", "river", "sktime", "statsmodels", "xarray"}
 """What extras or the pages themselves ask users to install."""
 
@@ -59,7 +54,7 @@ def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
             exec(compile(block[2], f"{page.name}: block {i}", "exec"), namespace)
         follows = i + 1 < len(blocks) and not text[block.end() : blocks[i + 1].start()].strip()
         if follows and blocks[i + 1][1] == "text":
-            assert squeezed(printed.getvalue()) == squeezed(blocks[i + 1][2])
+            assert pages.differences(printed.getvalue(), [blocks[i + 1][2]], sample=False) == []
 
 
 WARNED = {"examples/counts.py", "examples/segmentation.py"}
