@@ -56,10 +56,8 @@ def test_text_in_a_numeric_column_is_named_with_its_row(tmp_path):
 
 
 def test_names_and_tables_of_the_wrong_kind():
-    assert "with data=, y is the name of a column; got a ndarray" in message(ValueError, np.zeros(3), "u", data=table())
-    assert "data must be a table (pandas, polars, pyarrow) or a path; got a int" in message(
-        ValueError, "y", "u", data=3
-    )
+    assert "with data=, y is the name of a column; got ndarray" in message(ValueError, np.zeros(3), "u", data=table())
+    assert "data must be a table (pandas, polars, pyarrow) or a path; got int" in message(ValueError, "y", "u", data=3)
     assert "by='unit' names a column of a table, so data= is needed" in message(ValueError, [1.0], [1.0], by="unit")
     assert "units= maps the names of columns" in message(ValueError, [1.0], [1.0], units={"y": "m"})
     data = table().with_columns(u=pl.Series([pl.date_range(pl.date(2024, 1, 1), pl.date(2024, 1, 2), eager=True)] * 40))

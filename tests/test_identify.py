@@ -248,7 +248,7 @@ def test_the_page_and_the_data_of_an_answer(pump, tmp_path):
 
 CODES = {
     "no such column": (["--y", "flux"], 2, "no column 'flux'"),
-    "no output named": ([], 2, "name the output with --y"),
+    "no output named": ([], 2, "name the output, y= or --y"),
     "no numbers": (["--not-u", "flow,speed,pressure,temperature,humidity"], 3, "no column holds numbers that move"),
     "two outputs": (["--y", "flow,speed"], 2, "it explains one output; call it for flow and for speed"),
     "too few rows": (["--y", "flow", "--limits", "flow=0:11"], 3, "24 rows of 800 have all lags; at least 60"),

@@ -171,7 +171,7 @@ def test_interventions_move_the_level():
 
 def test_what_does_not_fit_a_law_is_refused():
     for laws, message in (
-        ({"b": Law.trend(1.0)}, "name 'b', which is no parameter"), ({"theta1": 3.0}, "must map names"),
+        ({"b": Law.trend(1.0)}, "names 'b', which is not a parameter"), ({"theta1": 3.0}, "must map names"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             track(Regression(2), Kalman(q=0.0, r=1.0, laws=laws), *data())
@@ -246,7 +246,7 @@ def test_planes_condition_and_streams_say_what_records_say():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("theta1", "is no constraint"), ("theta1 >=", "is no constraint"), ("theta1 * theta2 >= 0", "not linear"),
+        ("theta1", "is not a constraint"), ("theta1 >=", "is not a constraint"), ("theta1 * theta2 >= 0", "not linear"),
         ("b >= 0", "not linear"), ("1 <= theta1 <= 0", "no parameters satisfy"), ("0 <= theta1 <= theta2", "one sum"),
         ("theta1 != 0", "must compare"), ("theta1 >= theta1", "one sum"), ("__import__('os') >= 0", "not linear"),
     ],

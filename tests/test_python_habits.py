@@ -129,7 +129,7 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
         (lambda: track(ARX(2, 2), Y, U), "must be a tracker, such as AdaptiveKalman(); got an array of shape (200,)."),
         (lambda: track(ARX(2, 2), [K, Kalman], Y, U), "tracker is the class Kalman"),
         (lambda: track(ARX(2, 2), {"a": RLS}, "y", "u", data=pl.DataFrame(), by="k"), "tracker is the class RLS"),
-        (lambda: track("ARX(2, 2)", K, Y, U), "such as ARX(2, 2) or Regression(3); got 'ARX(2, 2)', a str."),
+        (lambda: track("ARX(2, 2)", K, Y, U), "such as ARX(2, 2) or Regression(3); got 'ARX(2, 2)' (str)."),
         (lambda: Live(ARX, Kalman), "Live: model is the class ARX itself"),
         (lambda: Live(K, ARX(2, 2)), f"the model comes first: Live({MODEL}, {TRACKER}, ...)."),
         (lambda: Live(ARX(2, 2)), "Live: tracker must be a tracker, such as AdaptiveKalman(); got None."),

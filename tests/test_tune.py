@@ -354,7 +354,7 @@ def test_frontier():
 @pytest.mark.parametrize(
     ("tracker", "options", "message"),
     [
-        (Kalman(q=1.0, r=1.0), {}, "leaves nothing open"),
+        (Kalman(q=1.0, r=1.0), {}, "settings left out of Kalman.*: none"),
         (AugmentedFLS(), {}, "use 'h-step'"),
         (FLS(), {"method": "aic"}, "must be one of"),
         (FLS(), {"bounds": (10.0, 1.0)}, "bounds must be"),

@@ -83,7 +83,7 @@ def _shown(value: Any) -> str:
     if isinstance(getattr(value, "shape", None), tuple):
         return f"an array of shape {tuple(value.shape)}"
     text = repr(value)
-    return f"{text if len(text) < 60 else f'{text[:57]}...'}, a {type(value).__name__}"
+    return f"{text if len(text) < 60 else f'{text[:57]}...'} ({type(value).__name__})"
 
 
 PLAIN = (np.ndarray, list, tuple, float, int)

@@ -305,7 +305,7 @@ def table_frame(data: Any) -> nw.DataFrame[Any]:
         frame = nw.from_native(data)
     except TypeError:
         raise ValueError(
-            f"data must be a table (pandas, polars, pyarrow) or a path; got a {type(data).__name__}."
+            f"data must be a table (pandas, polars, pyarrow) or a path; got {type(data).__name__}."
         ) from None
     return frame.collect() if isinstance(frame, nw.LazyFrame) else frame
 

@@ -138,7 +138,7 @@ def _in_order(time: Array, code: Array, axis: str, indexed: bool) -> bool:
 
 def _name(argument: str, value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"with data=, {argument} is the name of a column; got a {type(value).__name__}.")
+        raise ValueError(f"with data=, {argument} is the name of a column; got {type(value).__name__}.")
     return value
 
 

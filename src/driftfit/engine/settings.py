@@ -254,8 +254,8 @@ def as_numbers(name: str, values: Any) -> Array:
         except OverflowError:  # a whole number beyond all floats
             out[place] = math.inf if value > 0 else -math.inf
         except (TypeError, ValueError):
-            where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
-            raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
+            where = f"{name}: entry {place[0] if len(place) == 1 else place}" if place else name
+            raise ValueError(f"{where} is {value!r}, which is not a number.") from None
     return out
 
 

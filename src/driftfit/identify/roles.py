@@ -146,7 +146,7 @@ def roles(
         if not left:
             raise NoAnswerError("no column holds numbers that move; one output is needed.")
         if len(left) > 1:
-            raise ValueError(f"identify: name the output with --y; the columns of numbers are {', '.join(left)}.")
+            raise ValueError(f"identify: name the output, y= or --y; columns of numbers: {', '.join(left)}.")
         y = left[0]
     if worded := [name for name in (y, *(u or ())) if name not in numbers]:
         cell = str(frame[worded[0]][0])

@@ -71,7 +71,7 @@ def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     if isinstance(tracker, Bank) and groups is None:
         return _changes(tracker, bounds)
     if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
-        raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
+        raise ValueError(f"tune: groups belong to q and mu; settings left out: {', '.join(missing) or 'none'}.")
     if getattr(tracker, "laws", None) is not None and missing:
         return _laws(task, tracker, missing, bounds)
     if missing == ["mu"]:
@@ -83,8 +83,8 @@ def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     if missing == ["forgetting"]:
         return _memory(task, tracker, bounds)
     raise ValueError(
-        f"tune: {tracker!r} leaves {', '.join(missing) or 'nothing'} open; tune can find mu, q and r, or "
-        "forgetting. Leave out the settings to be found, as in FLS(), Kalman(r=0.1) or RLS()."
+        f"tune: settings left out of {tracker!r}: {', '.join(missing) or 'none'}. tune can find mu, q and r, or "
+        "forgetting: leave them out, as in FLS(), Kalman(r=0.1) or RLS()."
     )
 
 

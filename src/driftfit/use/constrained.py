@@ -136,7 +136,7 @@ def half_space(text: str, names: Sequence[str], verb: str = "constrain") -> Half
     except SyntaxError:
         tree = None
     if not isinstance(tree, ast.Compare):
-        raise ValueError(f'{verb}: {text!r} is no constraint such as "b1 >= 0" or "b1 + b2 == 1".')
+        raise ValueError(f'{verb}: {text!r} is not a constraint such as "b1 >= 0" or "b1 + b2 == 1".')
     try:
         sides = [_linear(side, places) for side in (tree.left, *tree.comparators)]
     except ValueError:

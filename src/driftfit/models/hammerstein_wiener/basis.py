@@ -484,9 +484,9 @@ def basis_of(value: Any) -> Basis | None:
     kind = {name.lower(): kind for name, kind in kinds.items()}.get(str(words[0]).replace("-", "").lower())
     if kind is None or kind is Functions or len(words) < 2:
         raise ValueError(
-            f"a block takes one of {', '.join(kinds)}, or None for the identity; on the command line "
-            "polynomial/DEGREE, legendre/DEGREE/LOW/HIGH, chebyshev/DEGREE/LOW/HIGH, piecewise-linear/KNOT/.., "
-            "bspline/DEGREE/KNOT/.., sigmoid/WIDTH/CENTRE/.., saturation/U_MAX or dead-zone/U_MAX; got "
-            f"{value!r}."
+            f"a block takes one of {', '.join(one for one in kinds if one[0] != '_')}, or None for the identity; on "
+            "the command line polynomial/DEGREE, legendre/DEGREE/LOW/HIGH, chebyshev/DEGREE/LOW/HIGH, "
+            "piecewise-linear/KNOT/.., bspline/DEGREE/KNOT/.., sigmoid/WIDTH/CENTRE/.., saturation/U_MAX or "
+            f"dead-zone/U_MAX; got {value!r}."
         )
     return kind.from_words(words[1:])

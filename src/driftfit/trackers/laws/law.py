@@ -155,7 +155,7 @@ def table_of(owner: str, laws: tuple[tuple[str, Law], ...], names: tuple[str, ..
     """
     for name, _ in laws:
         if name not in names:
-            raise ValueError(f"{owner}: laws name {name!r}, which is no parameter; {near(name, names)}")
+            raise ValueError(f"{owner}: laws names {name!r}, which is not a parameter; {near(name, names)}")
     columns: list[tuple[float, ...]] = []
     for i, name in enumerate(names):
         own = [law for owner_of_law, law in laws if owner_of_law == name]
