@@ -114,7 +114,6 @@ def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
     assert moved.before == pytest.approx(2.0, abs=0.1)
     assert moved.after == pytest.approx(2.6, abs=0.1)
     assert 0.6 / moved.std > 5.0
-    assert result.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
 
 
 @pytest.mark.parametrize("seed", range(3))
