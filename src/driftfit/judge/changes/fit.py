@@ -140,9 +140,8 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
 def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
     """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
     Only rows are used that are ``ok`` (N,), as are all their lags."""
-    N, found = len(v), np.zeros(2, np.int64)
-    ok = np.ones(N, bool) if ok is None else ok
-    limit, longest = HELD * deviation(v[ok]), max(most, min(season, N // 12))
+    ok = np.ones(len(v), bool) if ok is None else ok
+    limit, longest = HELD * deviation(v[ok]), max(most, min(season, len(v) // 12))
     while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
         longest -= 1  # fewer lags are known of more rows
     if most < 1 or len(at) <= 2 * longest:
@@ -160,7 +159,7 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
 
 
 def level_of(e: Array, first: int) -> Array:
-    """c (N,): the slowly changing level of white residuals e, in windows of residuals that are limited at three medians;
+    """c (N,): the slowly changing level of white residuals e, in windows, whose residuals are limited at three medians;
     constant where windows differ by no more than chance."""
     N, sizes = len(e), np.abs(e[first:])
     m = max(3, min(WINDOWS, N // 20))
