@@ -47,6 +47,8 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     Missing lags are replaced by the predictions of these constants. The samples of a model with hidden states are not
     those of a regression: none of them is usable.
     """
+    if model.hidden is not None:
+        model, record = Regression(model.n), Record(record.y, np.full((len(record), model.n), np.nan), record.known)
     first = _fitted(model, record)
     linearised = model.linearised
     if linearised is None or linearised.settling == 0.0 or not len(record):
@@ -60,9 +62,6 @@ def _fitted(model: Model, record: Record) -> Array:
     out = program.inspected(tile, len(record), COLLECTED)
     run = program.drivers(steps=program.steps._replace(store=collect)).run
     run(tile, *lanes_of(replace(record, known=record.known.common)), out)
-    if model.hidden is not None:
-        for name, value in (("ok", 0.0), ("valid", 0.0), ("y_hat", np.nan), ("e", np.nan)):
-            out[name] = value
     return out
 
 

@@ -29,8 +29,6 @@ LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
-PRICE_ERRORS = 1.5
-"""Standard errors by which a price is changed to see whether the number depends on more draws."""
 SWEEPS = 4
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
@@ -113,25 +111,21 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     gain = N * np.log(found.rss[0] / found.rss[:room])
     first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
 
-    def number(drawn: Array, constants: tuple[Array, Array], most: int) -> tuple[int, tuple[float, float]]:
-        """The number and its prices, from more draws of constants while it may depend on them."""
-        for count in DRAWS:
-            if most > len(drawn) < count:
-                drawn = np.vstack([drawn, draws.gains(*constants, count - len(drawn))])
-            (one, error), (two, other) = (price(each, level / SHARE) for each in drawn.T)
-            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (PRICE_ERRORS, -PRICE_ERRORS))
-            if len(drawn) >= DRAWS[1] and few == many:
-                break
+    def number(drawn: Array) -> tuple[int, tuple[float, float]]:
+        """The number and its prices, from gains (R, 2) in draws of constants."""
+        one, two = (price(each, level / SHARE) for each in drawn.T)
         return stepwise(gain, (one, two)) or first, (one, two)
 
-    dynamic = len(noise.lags) or len(model.lags.columns)
-    K, prices = number(test.gains, draws.constants, 0 if dynamic else DRAWS[-1])
+    dynamic, more = len(noise.lags) or len(model.lags.columns), DRAWS[-1] - len(test.gains)
+    if not dynamic and more > 0:
+        test = test._replace(gains=np.vstack([test.gains, draws.gains(*draws.constants, more)]))
+    K, prices = number(test.gains)
     if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = found.at[K, :K], found.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if draws.root(mean, ar) < 1.0:
-            K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
+            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
     return found.at[K, :K], found.ar[K], prices
 
 

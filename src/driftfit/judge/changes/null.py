@@ -205,12 +205,11 @@ def p_of(x: Array, drawn: Array) -> Array:
     return np.asarray(np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail))
 
 
-def price(drawn: Array, level: float) -> tuple[float, float]:
-    """What draws (R,) exceed with probability ``level``, which may be below 1 / R, and its standard error."""
+def price(drawn: Array, level: float) -> float:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
     R = len(drawn)
     top = np.sort(drawn)[-max(10, R // 10) :]
-    mean, reach = float(np.mean(top[1:] - top[0])), np.log(len(top) / (R + 1) / level)
-    return float(top[0] + mean * reach), float(mean * np.sqrt((1.0 + reach**2) / len(top)))
+    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
 
 
 def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
