@@ -37,7 +37,7 @@ CLOCKS = re.compile(
 )
 SAMPLED = (
     "coarse_coverage", "coverage_of_models", "curved_outputs", "diagnose_constancy", "event_dates",
-    "jump_control", "output_error", "smoothing_coverage",
+    "jump_control", "output_error", "smoothing_coverage", "smoothing_over_hypotheses",
 )  # fmt: skip
 """Benchmarks of which ``--quick`` prints rows of the page, in a few seconds; others have fewer records then."""
 

@@ -5,6 +5,7 @@ import pytest
 from support import arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
+from driftfit.data.record import Known
 from driftfit.judge.compare import compare
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
 
@@ -44,5 +45,5 @@ def test_collinear_regressors_lose_nothing():
     past = [np.linalg.lstsq(phi[:t], y[:t], rcond=1e-9)[0] for t in range(10, 120)]
     expected = y[10:] - np.sum(phi[10:] * past, axis=1)
     for order in (range(6), (3, 0, 4, 1, 5, 2)):
-        got = constant_errors(phi[:, order], y, np.ones(120))
+        got = constant_errors(phi[:, order], y, Known.of())
         assert got[10:] == pytest.approx(expected, abs=1e-10)

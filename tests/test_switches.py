@@ -1,12 +1,10 @@
 """Structures that change: found where they do, dated with intervals that cover, and not found where they do not."""
 
-import itertools
-
 import numpy as np
 import pytest
 
 from driftfit import ARX, OE, RLS, grid, select
-from driftfit.judge.structures.switches import dated, most_probable
+from driftfit.judge.structures.switches import switches
 
 DELAYS = grid(ARX, na=[1], nb=[1], nk=[1, 2, 3])
 
@@ -38,25 +36,14 @@ def test_no_change_is_found_where_there_is_none():
     assert sum(count) <= 1
 
 
-def test_the_path_is_the_most_probable_of_all():
-    rng = np.random.default_rng(0)
-    terms, change = rng.normal(size=(7, 3)), 0.2
-
-    def weight(path):
-        moves = sum(np.log(1.0 - change) if a == b else np.log(change / 2) for a, b in itertools.pairwise(path))
-        return moves + sum(terms[t, k] for t, k in enumerate(path))
-
-    best = max(itertools.product(range(3), repeat=7), key=weight)
-    assert tuple(most_probable(terms, change)) == best
-
-
 def test_a_date_without_noise_is_exact_and_settings_are_checked():
     rng = np.random.default_rng(1)
     phi = rng.normal(size=(100, 2))
     y = np.where(np.arange(100) < 47, 2.0 * phi[:, 0], -phi[:, 1])
-    assert dated(y, phi[:, :1], phi[:, 1:], 60) == (47, 47, 47)
+    ((*dates, _, _),) = switches("ab", y, phi, [[0], [1]], 0.05)
+    assert dates == [47, 47, 47]
     found = select(DELAYS, *record(0, np.full(500, 1)), tracker=RLS(0.98))
-    with pytest.raises(ValueError, match=r"between 0 and 0\.5"):
-        found.switches(0.9)
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        found.switches(5)
     with pytest.raises(ValueError, match="columns of one regression"):
         select([ARX(1, 1), OE(1, 1)], *record(0, np.full(500, 1)), tracker=RLS(0.98)).switches()

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from scipy import signal
-from support import THETA, arx_record, damaged
+from support import THETA, arx_record
 
 from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, track
-from driftfit.judge.constant_fit import constant_errors
 from driftfit.judge.evidence import judged_rows
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.robust import robust_fit
@@ -114,7 +113,6 @@ def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
     assert moved.before == pytest.approx(2.0, abs=0.1)
     assert moved.after == pytest.approx(2.6, abs=0.1)
     assert 0.6 / moved.std > 5.0
-    assert result.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -171,17 +169,6 @@ def test_following_correlated_noise_does_not_pay():
     b = np.where(np.arange(300) < 150, 0.5, 2.0)
     moved = track(Regression(1, intercept=True), Kalman(q=0.01, r=1.0), b * u + rng.normal(size=300), u).verdict()
     assert moved.pays
-
-
-def test_constants_with_lags_are_those_of_more_regressors():
-    """Rows that are missing are left out, and weighted as the run's own."""
-    y, u = damaged(*arx_record(200, 4))
-    weights = np.where(np.arange(200) % 3 == 0, 0.2, 1.0)
-    phi = np.column_stack([u, np.roll(u, 1), np.roll(y, 1)])
-    e = constant_errors(phi, y, weights)
-    assert np.array_equal(np.isfinite(e), (np.abs(np.column_stack([phi, y])) < 1e100).all(axis=1))
-    run = track(Regression(3), RLS(1.0), y, phi, weights=weights)
-    assert e[40:] == pytest.approx(run.innovation[40:], rel=1e-6, nan_ok=True)
 
 
 def test_records_that_can_tell_nothing():

@@ -29,7 +29,7 @@ def test_the_unit_of_y_changes_no_p_value(unit):
     phi = np.column_stack([np.ones(600), u])
     one, other = judged(phi, y), judged(phi, unit * y)
     assert len(one.model.noise.lags) == len(other.model.noise.lags) > 0
-    assert [other.test.p, *other.test.p_path] == pytest.approx([one.test.p, *one.test.p_path], rel=1e-8)
+    assert [other.test.p, *other.test.p_each] == pytest.approx([one.test.p, *one.test.p_each], rel=1e-8)
 
 
 @pytest.mark.parametrize("slope", [0.0, 2.0])

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.data.record import Record
+from driftfit.data.record import Known, Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_errors, constant_least_squares
@@ -96,7 +96,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
     arx = constant_least_squares(_constant_arx(u.shape[1]), Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    lagged = _with_lags(run.model, steady, y, constant, record.known.noise)
+    lagged = _with_lags(run.model, steady, y, constant, record.known)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
     rows = len(run.program.whole.outputs)
     own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
@@ -107,13 +107,13 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     return Errors(*own, scored)
 
 
-def _with_lags(model: Model, steady: Array, y: Array, constant: Array, noise: Array) -> Array:
+def _with_lags(model: Model, steady: Array, y: Array, constant: Array, given: Known) -> Array:
     """Errors (T,) of constants on the regressors of a run, the last outputs, and the last regressors.
 
     ``constant`` are the errors without lags. Regressors that hold the present output predict nothing: where a model has
     such, lags of the regressors and errors predict ``constant``, once the parameters are known.
     """
-    T, used = len(y), (steady["valid"] > 0.0) & (noise < np.inf)[:, None]
+    T, used = len(y), (steady["valid"] > 0.0) & np.broadcast_to(given.noise < np.inf, len(y))[:, None]
     phi = np.where(used, steady["phi"][..., 0], np.nan)
     known = np.cumsum(steady["ok"][:, 0]) > LEARNED * model.n if model.implicit else np.isfinite(y)
     y = np.where(known, constant if model.implicit else steady["y"][:, 0], np.nan)
@@ -121,7 +121,7 @@ def _with_lags(model: Model, steady: Array, y: Array, constant: Array, noise: Ar
     for k in range(1, min(LAGS, T - 1) + 1):
         last[k - 1, k:] = np.column_stack([y, phi])[:-k]
     columns = [*last] if model.implicit else [phi, *last]
-    return constant_errors(np.column_stack(columns), y, np.broadcast_to(1.0 / noise, T))
+    return constant_errors(np.column_stack(columns), y, given)
 
 
 def compare(run: Track) -> Comparison:

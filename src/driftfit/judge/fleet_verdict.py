@@ -73,7 +73,7 @@ class Judgement:
     def moves(self) -> tuple[Moved, ...]:
         """The parameters that move, the clearest first."""
         named = (one for one in self.verdict.parameters if one.moves and self.drifts)
-        return tuple(sorted(named, key=lambda one: one.p_own))
+        return tuple(sorted(named, key=lambda one: -abs(one.after - one.before) / one.std if one.std > 0.0 else 0.0))
 
     @property
     def moving(self) -> tuple[str, ...]:

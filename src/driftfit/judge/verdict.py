@@ -23,7 +23,7 @@ fast as the noise itself is mistaken for such noise; where the noise is nearly a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -32,7 +32,6 @@ from rich.text import Text
 from driftfit.engine.drivers import ROUNDING
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.changes.changes import Changes
 from driftfit.judge.changes.words import Event, clause, events, rows
 from driftfit.judge.compare import left_at_start
 from driftfit.judge.evidence import REJECTED, Evidence, least_rows
@@ -51,19 +50,15 @@ RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 class Moved:
     """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: that of the path of the estimate, which separates
-    parameters with correlated regressors. ``moves``: whether it is named as moving. ``at``, ``when``: the sample, and
-    its time as text, of its clearest change, the beginning of one that takes time. ``before``: its value before its
-    first change. ``after``: the value furthest from that, and ``std`` the standard error of their difference, NaN for a
-    gradual change. ``last``: its last value, which is ``before`` again after a temporary fault. ``earliest``,
-    ``latest``: first and last sample of an interval that contains the date with 95 % confidence. ``instead``: the
-    parameters whose change at that time would explain the record as well; the record does not tell which of them moved.
+    ``moves``: whether it is named as moving. ``at``, ``when``: the sample, and its time as text, of its clearest
+    change, the beginning of one that takes time. ``before``: its value before its first change. ``after``: the value
+    furthest from that, and ``std`` the standard error of their difference, NaN for a gradual change. ``last``: its last
+    value, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first and last sample of an
+    interval that contains the date with 95 % confidence. ``instead``: the parameters whose change at that time would
+    explain the record as well; the record does not tell which of them moved.
     """
 
     name: str
-    statistic: float
-    p: float
-    p_own: float
     moves: bool
     at: int
     when: str
@@ -286,11 +281,6 @@ class Verdict(Printed):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for sentence in self.sentences:
             yield Text(f" {sentence}")
-        table = table_of("Parameters", "", "L", "p", "p own", "moves")
-        for m in self.parameters:
-            L = f"{m.statistic:.2f}" if m.statistic < 1e6 else f"{m.statistic:.3g}"
-            table.add_row(Text(m.name), L, p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
-        yield table
         if self.events:
             table = table_of("Changes", "", "at", "95 %", "until", "", "before", "after", "+-")
             for row in rows(self.events):
@@ -374,7 +364,6 @@ def judged(known: Evidence) -> Verdict:
     run, found, names = known.run, known.changes, known.names
     at, level = known.tested.at, known.level
     happened = () if found is None or not found.rejected else events(found, names, at, run.time_text)
-    own = {name: _moved(found, happened, name, i) for i, name in enumerate(names)} if found is not None else {}
     scored = known.errors.scored
     y = run.y[scored]
     error, *others = (rounded(each[scored], y) for each in known.errors[:-1])
@@ -385,9 +374,9 @@ def judged(known: Evidence) -> Verdict:
         drifts=None if found is None else found.rejected,
         pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
         p=known.p,
-        statistic=float("nan") if found is None else float(found.test.L[0]),
+        statistic=float("nan") if found is None else found.test.L,
         level=level,
-        parameters=tuple(own.get(name, unjudged(name)) for name in run.model.names),
+        parameters=tuple(_moved(happened, name) for name in run.model.names),
         events=happened,
         weights=found.kind.weights if found is not None and found.rejected else {},
         rms=root_mean_square(error),
@@ -406,22 +395,15 @@ def judged(known: Evidence) -> Verdict:
     )
 
 
-def unjudged(name: str) -> Moved:
-    """What is said of a parameter that the test does not judge."""
-    nan = float("nan")
-    return Moved(name, nan, nan, nan, False, 0, "", nan, nan, nan, nan, 0, 0)
-
-
-def _moved(found: Changes, happened: Sequence[Event], name: str, i: int) -> Moved:
-    """What is said of parameter i."""
-    n = len(found.test.theta)
-    L, p, p_own = float(found.test.L[1 + i]), float(found.test.p_path[i]), float(found.test.p_path[n + i])
+def _moved(happened: Sequence[Event], name: str) -> Moved:
+    """What is said of a parameter."""
     own = [(event, move) for event in happened for move in event.moves if move.name == name]
     if not own:
-        return replace(unjudged(name), statistic=L, p=p, p_own=p_own)
+        nan = float("nan")
+        return Moved(name, False, 0, "", nan, nan, nan, nan, 0, 0)
     before = own[0][1].before
     event, move = max(own, key=lambda one: abs(one[1].after - one[1].before) / one[1].std if one[1].std > 0.0 else 0.0)
     far = max(own, key=lambda one: abs(one[1].after - before))[1]
     last = own[-1][1].before if own[-1][0].kind == "temporary" else own[-1][1].after
     where = (event.at, event.when, before, far.after, far.std, last, event.earliest, event.latest)
-    return Moved(name, L, p, p_own, True, *where, move.instead)
+    return Moved(name, True, *where, move.instead)

@@ -121,19 +121,18 @@ DIAGNOSTICS = "The innovations (one-step errors), the excitation, and the consta
 
 
 def _parameter_table(summary: Summary, truth: Verdict) -> str:
-    heads = ("parameter", "now", "95 % band", "range of the path", "p, constant", "moves")
+    heads = ("parameter", "now", "95 % band", "range of the path", "moves")
     tests = {moved.name: moved for moved in truth.parameters}
     rows = []
     for row in summary.rows:
         test = tests.get(row.name)
-        moved = "no" if test is not None and np.isfinite(test.p_own) else ""
+        moved = "no" if test is not None and truth.drifts is not None and row.name not in truth.held else ""
         if test is not None and test.moves:
             moved = f"{change(test)}, {escape(test.when)}"
         values = (row.theta, row.low, row.high, row.path_low, row.path_high)
         theta, low, high, least, most = (digits(value, row.std) for value in values)
         cells = (theta, f"{low} to {high}", f"{least} to {most}")
-        p = "" if test is None else escape(p_text(test.p_own))
-        rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, p, moved))
+        rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, moved))
     caption = f"After the last sample; the range is that of the path after the first {summary.burn} samples."
     return table(caption, heads, rows)
 

@@ -20,7 +20,6 @@ samples; the filter runs again from checkpoints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +32,6 @@ from driftfit.smooth.solvers.components import (
     MOVE,
     ROOMY,
     SHARE,
-    UNLIKELY,
     Filter,
     Moves,
     Noises,
@@ -58,6 +56,8 @@ NEAR = 16
 """Samples to either side of such a place that get more components."""
 CONSTANT = 0.2
 """Change of the log evidence from one sample to the next that is accepted."""
+NEGLIGIBLE = 8.0
+"""Log of the ratio to the most probable pair below which a pair is left out of the moments."""
 VAGUE = 1e-11
 """Information on theta outside the record, as a share of the root of that in one sample."""
 
@@ -261,7 +261,7 @@ def meet(
         for k in range(C):
             ahead = max(facts[f, LOG] - facts[f, SHARE], more[k, LOG] - more[k, SHARE])
             c = facts[f, LOG] + more[k, LOG]
-            if facts[f, MODE] != more[k, MODE] or c - ahead < top - UNLIKELY:
+            if facts[f, MODE] != more[k, MODE] or c - ahead < top - NEGLIGIBLE:
                 continue
             copy_upper(X[f], W)
             for q in range(n):
@@ -269,10 +269,10 @@ def meet(
                     row[j] = Y[k, q, j] if j >= q else 0.0
                 e = absorb(W, row)
                 c -= 0.5 * e * e
-                if c - ahead < top - UNLIKELY:
+                if c - ahead < top - NEGLIGIBLE:
                     break
             c -= max(log_det(W), ahead)  # of a pair that is given up, W lacks rows
-            if c < top - UNLIKELY:
+            if c < top - NEGLIGIBLE:
                 continue
             w = np.exp(c - top)
             if c > top:
@@ -360,21 +360,6 @@ def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | N
         if np.array_equal(found.needed, found.kept):
             return found
         passes = Passes(passes.problem, found.needed)
-
-
-def average(w: Array, found: Sequence[Mixture]) -> Mixture:
-    """The mixture of mixtures with shares w (K,) that sum to 1; evidence and components are those of the first."""
-    theta = np.asarray(sum(share * one.theta for share, one in zip(w, found, strict=True)))
-    events = np.asarray(sum(share * one.events for share, one in zip(w, found, strict=True)))
-    moved = w[:, None] * np.array([1.0 - one.events[:, 0] for one in found])
-    moved = (moved / np.maximum(moved.sum(axis=0), np.finfo(float).tiny))[:, :, None]
-    shift = np.asarray(sum(share * one.shift for share, one in zip(moved, found, strict=True)))
-    cov, shift_var = np.zeros_like(found[0].cov), np.zeros_like(shift)
-    for share, given, one in zip(w, moved, found, strict=True):
-        away = one.theta - theta
-        cov += share * (one.cov + (away**2 if cov.ndim == 2 else away[:, :, None] * away[:, None, :]))
-        shift_var += given * (one.shift_var + (one.shift - shift) ** 2)
-    return found[0]._replace(theta=theta, cov=cov, events=events, shift=shift, shift_var=shift_var)
 
 
 def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:

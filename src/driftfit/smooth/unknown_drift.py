@@ -13,14 +13,14 @@ found in three steps:
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
        hundredth (`driftfit.smooth.solvers.elimination`): climb by half powers of ten, for all parameters or one group,
        and average over the ratios that were tried, of which the smallest moves the path by less than its error;
-    3. the path is the average over `SCALES` of these ratios, weighted by the evidence.
+    3. the root of the drift of the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
 another model of the same record (`driftfit.smooth.solvers.slopes`) and are averaged likewise; where they are more
 probable than not, they are taken.
 
 Source: Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by their likelihood; the three steps are
-ours. Cost per sample: eleven filters of `FEW` components, two to five smoothers of mixtures, and O(n^3) for each try.
+ours. Cost per sample: eight filters of `FEW` components, two or three smoothers of mixtures, and O(n^3) for each try.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ PER_SAMPLE = 3e-3
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
 EDGE = 10.0
 """The smallest ratio times T^2, and the largest."""
-SCALES = 3.0 ** np.arange(-1, 3)
+SCALES = 4.0 ** np.arange(-1, 2)
 SHARE = 200.0
 FEW = 8
 """Components with which evidences are computed, and the path where they suffice."""
-LIKELY_SCALE, LIKELY_RATIO = 0.1, 0.01
-"""Shares of the best below which scales, and ratios or slopes, are left out."""
+LIKELY_RATIO = 0.01
+"""Share of the best below which ratios or slopes are left out."""
 TRENDS = 3.0
 """Penalty of slopes that walk, in units of the log-likelihood."""
 
@@ -107,7 +107,7 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
         return walk._replace(drift_root=np.sqrt(np.diag(problem.alternatives.roots[0]) ** 2 * time + jumps))
     price = TRENDS + np.sum(1.0 - first.events[:, 0]) * np.log(PER_SAMPLE)
     p, paths, q = likely
-    walk = walk._replace(drift_root=np.sqrt(q * time + jumps), mixture=mean_of(problem, q, first.needed))
+    walk = walk._replace(drift_root=np.sqrt(q * time + jumps), mixture=of_scales(problem, q, first.needed))
     return with_slopes(walk, p, paths, trend, price)
 
 
@@ -205,12 +205,8 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
     return p, np.array([*paths.values()]), p @ ratios[np.array([*paths])] * unit
 
 
-def mean_of(problem: Problem, q: Array, keep: Array) -> Mixture:
-    """The average of the mixtures with all likely scales of the drift q (n,)."""
-    scales = [Passes(drifting(problem, np.diag(np.sqrt(scale * q))), keep) for scale in SCALES]
-    logs = np.array([one.forward() for one in scales])
-    order = [k for k in np.argsort(-logs) if logs[k] > logs.max() + np.log(LIKELY_SCALE)]
-    found = [mixture.smooth(scales[order[0]], True)]
-    enough = np.array_equal(found[0].kept, keep)
-    found += [mixture.smooth(scales[k] if enough else scales[k].problem, True, found[0].kept) for k in order[1:]]
-    return mixture.average(shares(logs[order]), found)
+def of_scales(problem: Problem, q: Array, keep: Array) -> Mixture:
+    """The mixture with the drift q (n,) times a scale, whose root is the average over `SCALES`."""
+    roots = [np.diag(np.sqrt(scale * q)) for scale in SCALES]
+    logs = [Passes(drifting(problem, root), np.full(len(keep), FEW)).forward() for root in roots]
+    return mixture.smooth(drifting(problem, np.einsum("k,kij->ij", shares(np.array(logs)), roots)), True, keep)

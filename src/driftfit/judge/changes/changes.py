@@ -34,7 +34,7 @@ class Changes:
 
     @cached_property
     def _all(self) -> tuple[Dated, Which, Kind]:
-        model, test, (breaks, ar, prices) = self.model, self.test, self.start
+        model, (breaks, ar, prices) = self.model, self.start
         N, n = model.phi.shape
         found = dated(model, breaks, ar, prices, self.dates)
         none = Which(NONE, (), (), (), found.theta, found.std[1:], found.rss, n)
@@ -43,7 +43,7 @@ class Changes:
             found = dated(model, changed.dates, ar, prices, self.dates, final=True)
         moving = tuple(sorted({j for own in changed.at for j in own}))
         if self.rejected and not moving:
-            moving = (int(np.argmin(test.p_path[n:])),)
+            moving = tuple(range(n))
         own = kind(model, found, changed, moving) if moving else Kind("", {}, (0, N - 1), np.zeros((N, 0)), (), ())
         moved = model.offset + np.zeros((len(found.breaks) + 1, 1))
         return (

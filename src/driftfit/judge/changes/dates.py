@@ -18,19 +18,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.judge.changes.fit import MOST, estimated, noise_of, order_of, regressed, split, white_rows
 from driftfit.judge.changes.null import DRAWS, Draws, Model, Tested, price
 from driftfit.judge.changes.recursion import searched
-from driftfit.judge.changes.scan import SINGULAR, add
-from driftfit.judge.statistics.robust import SMALL, eliminate, orthonormal, solved
+from driftfit.judge.changes.scan import SINGULAR
+from driftfit.judge.statistics.robust import SMALL, orthonormal
 
 LEVEL = 0.95
 """Share of the likelihood in the interval of a date."""
 SHARE = 5.0
 """A further break has the level of the test divided by this."""
-PRICE_ERRORS = 1.5
-"""Standard errors by which a price is changed to see whether the number depends on more draws."""
 SWEEPS = 4
 RANK = 1e-12
 """Smallest singular value that counts, as a share of the largest."""
@@ -38,64 +36,28 @@ LEVERAGE = 0.1
 """Smallest share of a residual that its own row is taken to leave."""
 
 
-@Driver
-def _profiled(
-    X: Array, Z: Array, noise: tuple[Array, Array, Array], place: Array, start: int, least: float, rss: Array,
-    theta: Array,
-) -> None:  # fmt: skip
-    """Sums of squares (m,) and parameters (m, 2 n) of the segments beside a break at each ``place``.
-
-    Z: white rows of both, the first of them row ``start`` of X, whose lags are all in the first segment.
-    """
-    (lags, ar, g), n = noise, X.shape[1]
-    p, k = lags.shape[0], 2 * n
-    first = lags[p - 1] if p > 0 else 0
-    total, left, passed = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
-    G, row, done = np.zeros((k + 1, k + 1)), np.zeros(k + 1), 0
-    add(n, Z, 0, Z.shape[0], total)
-    add(n, Z, 0, first, passed)
-    for d in range(place.shape[0]):
-        at = place[d] - start
-        add(n, Z, done, at, left)
-        add(n, Z, done + first, at + first, passed)
-        done = at
-        for i in range(n + 1):
-            for j in range(i + 1):
-                G[n + i, n + j] = total[i, j] - passed[i, j]
-                if i < n:
-                    G[i, j], G[n + i, j], G[n + j, i] = left[i, j], 0.0, 0.0
-        for i in range(n):
-            G[k, i] = left[n, i]
-        G[k, k] += left[n, n]
-        for t in range(place[d], place[d] + first):
-            for j in range(n):
-                row[n + j] = X[t, j]
-                for i in range(p):
-                    if t - lags[i] >= place[d]:
-                        row[n + j] -= ar[i] * X[t - lags[i], j]
-                row[n + j] *= g[t]
-                row[j] = Z[t - start, j] - row[n + j]
-            row[k] = Z[t - start, n]
-            for i in range(k + 1):
-                for j in range(i + 1):
-                    G[i, j] += row[i] * row[j]
-        for i in range(k):
-            G[i, i] += least
-        rss[d] = eliminate(G, k, 0.0)
-        solved(G, theta[d])
-
-
 def profile(model: Model, ar: Array, breaks: Array, k: int, gap: int) -> tuple[Array, Array, Array]:
     """Break k at every place (m,) up to its neighbours, less ``gap`` rows: the places, the sums of squares (m,) of the
     segments beside it, and their parameters (m, 2, n) in the basis. Rows of two segments have the lags of both."""
     X, lags, g = model.X, model.noise.lags, model.noise.g
-    N, n = X.shape
+    (N, n), first = X.shape, order_of(lags)
     low, high = breaks[k - 1] if k else 0, breaks[k + 1] if k + 1 < len(breaks) else N
     place = np.union1d(np.arange(low + gap, high - gap + 1), breaks[k])
     Z = np.column_stack(white_rows(X[low:high], model.y[low:high], lags, ar, g[low:high]))
+    sums = np.cumsum(np.concatenate([np.zeros((1, n + 1, n + 1)), Z[:, :, None] * Z[:, None, :]]), axis=0)
+    at, G = place - low - first, np.zeros((len(place), 2 * n + 1, 2 * n + 1))
+    for side, own in ((slice(0, n), sums[at]), (slice(n, 2 * n), sums[-1] - sums[at + first])):
+        G[:, side, side], G[:, -1, side] = own[:, :n, :n], own[:, n, :n]
+        G[:, -1, -1] += own[:, n, n]
+    for i in range(first):
+        t = place + i
+        later = X[t] - sum(a * X[t - lag] for lag, a in zip(lags, ar, strict=True) if lag <= i)
+        later *= g[t, None]
+        row = np.hstack([Z[at + i, :n] - later, later, Z[at + i, n:]])
+        G += row[:, :, None] * row[:, None, :]
     least = SINGULAR * float(np.sum((X * g[:, None]) ** 2, axis=0).max()) + SMALL
-    rss, theta = np.empty(len(place)), np.empty((len(place), 2 * n))
-    _profiled(X, Z, (lags, ar, g), place, low + order_of(lags), least, rss, theta)
+    theta = np.linalg.solve(G[:, :-1, :-1] + least * np.eye(2 * n), G[:, -1, :-1, None])[..., 0]
+    rss = G[:, -1, -1] - np.sum(G[:, -1, :-1] * theta, axis=1)
     return place, np.maximum(rss, model.floor), theta.reshape(len(place), 2, n)
 
 
@@ -149,25 +111,21 @@ def counted(model: Model, test: Tested, draws: Draws, level: float) -> tuple[Arr
     gain = N * np.log(found.rss[0] / found.rss[:room])
     first = min(1 if test.p_each[:2].min() <= test.p_each[2] else 2, room - 1)
 
-    def number(drawn: Array, constants: tuple[Array, Array], most: int) -> tuple[int, tuple[float, float]]:
-        """The number and its prices, from more draws of constants while it may depend on them."""
-        for count in DRAWS:
-            if most > len(drawn) < count:
-                drawn = np.vstack([drawn, draws.gains(*constants, count - len(drawn))])
-            (one, error), (two, other) = (price(each, level / SHARE) for each in drawn.T)
-            few, many = (stepwise(gain, (one + k * error, two + k * other)) for k in (PRICE_ERRORS, -PRICE_ERRORS))
-            if len(drawn) >= DRAWS[1] and few == many:
-                break
+    def number(drawn: Array) -> tuple[int, tuple[float, float]]:
+        """The number and its prices, from gains (R, 2) in draws of constants."""
+        one, two = (price(each, level / SHARE) for each in drawn.T)
         return stepwise(gain, (one, two)) or first, (one, two)
 
-    dynamic = len(noise.lags) or len(model.lags.columns)
-    K, prices = number(test.gains, draws.constants, 0 if dynamic else DRAWS[-1])
+    dynamic, more = len(noise.lags) or len(model.lags.columns), DRAWS[-1] - len(test.gains)
+    if not dynamic and more > 0:
+        test = test._replace(gains=np.vstack([test.gains, draws.gains(*draws.constants, more)]))
+    K, prices = number(test.gains)
     if K and dynamic:  # changes made the dynamics of constants too slow
         breaks, ar = found.at[K, :K], found.ar[K]
         theta, _ = estimated(model.X, model.y, (noise.lags, ar, noise.g), breaks)
         mean = model.basis @ (np.diff(np.concatenate([[0], breaks, [N]])) / N @ theta)
         if draws.root(mean, ar) < 1.0:
-            K, prices = number(test.gains[:0], (mean, ar), DRAWS[-1])
+            K, prices = number(draws.gains(mean, ar, DRAWS[-1]))
     return found.at[K, :K], found.ar[K], prices
 
 

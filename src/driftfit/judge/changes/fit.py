@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.judge.changes.recursion import searched
 from driftfit.judge.changes.scan import SINGULAR, problem_of
-from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, eliminate, invertible, scale_of
+from driftfit.judge.statistics.robust import ROUNDED, SMALL, Fit, deviation, invertible
 from driftfit.judge.statistics.whiteness import loudest, ranks
 
 NONE = np.zeros(0, np.int64)
@@ -137,72 +137,40 @@ def regressed(v: Array, g: Array, lags: Array) -> Array:
     return coefficients(past * w[:, None], v[first:] * w) if len(lags) else np.zeros(0)
 
 
-@Driver
-def _choose(G: Array, count: int, most: int, chosen: Array) -> None:
-    """The order, up to ``most``, and the lag of a season, or 0, that `lags_of` chooses from sums G of so many rows."""
-    last = G.shape[0] - 1
-    for i in range(last + 1):
-        G[i, i] += SINGULAR * G[i, i] + SMALL
-    eliminate(G, most, 0.0)
-    price = np.log(count + last)
-    least = SINGULAR * G[last, last]
-    left = best = G[last, last]
-    for p in range(1, most + 1):
-        left -= G[last, p - 1] * G[last, p - 1] * G[p - 1, p - 1]
-        if np.log(max(left, least) / best) * count + price * (p - chosen[0]) < 0.0:
-            best, chosen[0] = max(left, least), p
-    share = 0.0
-    for s in range(most, last):
-        rest, tie = G[s, s], G[last, s]
-        for j in range(chosen[0]):
-            rest -= G[s, j] * G[s, j] * G[j, j]
-            tie -= G[s, j] * G[last, j] * G[j, j]
-        if tie * tie > share * best * max(rest, SMALL):
-            share, chosen[1] = min(tie * tie / (best * max(rest, SMALL)), 1.0 - SINGULAR), s + 1
-    if share > 0.0 and -count * np.log1p(-share) < price + 2.0 * np.log(last - most):
-        chosen[1] = 0
-
-
 def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) -> Array:
     """Lags of the autoregression of v (N,): those up to an order of least BIC, and one of a season if it is clear.
     Only rows are used that are ``ok`` (N,), as are all their lags."""
-    N, found = len(v), np.zeros(2, np.int64)
-    ok = np.ones(N, bool) if ok is None else ok
-    limit, longest = HELD * deviation(v[ok]), max(most, min(season, N // 12))
+    ok = np.ones(len(v), bool) if ok is None else ok
+    limit, longest = HELD * deviation(v[ok]), max(most, min(season, len(v) // 12))
     while len(at := complete(ok, np.arange(1, longest + 1))) <= 2 * longest and longest > 1:
         longest -= 1  # fewer lags are known of more rows
     if most < 1 or len(at) <= 2 * longest:
         return NONE
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
     rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
-    _choose(rows.T @ rows, len(at), min(most, longest), found)
-    lags = np.arange(1, found[0] + 1)
-    return np.append(lags, found[1]) if found[1] else lags
-
-
-@Driver
-def _levels(e: Array, first: int, edges: Array) -> Array:
-    """log (m,): the level of e (N,) in windows between edges (m + 1,), of residuals limited at three medians."""
-    least, own = max(scale_of(e[first:]), 1e-3 * np.std(e[first:]), SMALL), np.empty(len(edges) - 1)
-    for k in range(len(own)):
-        sizes = np.sort(np.abs(e[edges[k] : edges[k + 1]]))
-        count = len(sizes)
-        middle = 0.5 * (sizes[(count - 1) // 2] + sizes[count // 2])
-        square = np.minimum(sizes, HELD * max(MEDIAN * middle, 0.05 * least)) ** 2
-        own[k] = np.log(max(np.sqrt(np.sum(square) / count), 0.05 * least))
-    return own
+    R, most, price = np.linalg.qr(rows, mode="r"), min(most, longest), np.log(len(at) + longest)
+    left = np.maximum(np.cumsum(R[::-1, -1] ** 2)[::-1][: most + 1], SINGULAR * np.sum(R[:, -1] ** 2) + SMALL)
+    order = int(np.argmin(len(at) * np.log(left) + price * np.arange(most + 1)))
+    rest = R[order:, most:]  # what the first lags do not explain
+    share = (rest[:, :-1].T @ rest[:, -1]) ** 2 / (np.sum(rest[:, :-1] ** 2, axis=0) * left[order] + SMALL)
+    if longest > most and -len(at) * np.log1p(-min(share.max(), 1.0 - SINGULAR)) > price + 2.0 * np.log(longest - most):
+        return np.append(np.arange(1, order + 1), most + 1 + int(np.argmax(share)))
+    return np.arange(1, order + 1)
 
 
 def level_of(e: Array, first: int) -> Array:
-    """c (N,): the slowly changing level of white residuals e, constant where windows differ by no more than chance."""
-    N = len(e)
+    """c (N,): the slowly changing level of white residuals e, in windows, whose residuals are limited at three medians;
+    constant where windows differ by no more than chance."""
+    N, sizes = len(e), np.abs(e[first:])
     m = max(3, min(WINDOWS, N // 20))
-    edges = first + (N - first) * np.arange(m + 1) // m
-    own = _levels(e, first, edges)
+    least = 0.05 * max(deviation(e[first:]), 1e-3 * float(np.std(e[first:])), SMALL)
+    windows = sizes[len(sizes) % m :].reshape(m, -1)
+    limit = HELD * np.maximum(MEDIAN * np.median(windows, axis=1, keepdims=True), least)
+    own = np.log(np.maximum(np.sqrt(np.mean(np.minimum(windows, limit) ** 2, axis=1)), least))
     chance = 0.6 * m / N  # variance of the logarithm of a deviation of N / m Gaussians
     share = max(0.0, 1.0 - 1.5 * chance / max(float(own.var()), chance))
-    middle = float(np.sort(own)[(m - 1) // 2 : m // 2 + 1].mean())
-    return np.asarray(np.exp(middle + np.interp(np.arange(N), 0.5 * (edges[:-1] + edges[1:]), share * (own - middle))))
+    middle, place = float(np.median(own)), N - windows.shape[1] * (m - 0.5 - np.arange(m))
+    return np.asarray(np.exp(middle + np.interp(np.arange(N), place, share * (own - middle))))
 
 
 def rise(N: int, ends: tuple[int, int]) -> Array:
@@ -236,7 +204,7 @@ def divided(
 ) -> tuple[Array, Array, float]:
     """(breaks, ar, criterion) of the best partition whose noise has these lags."""
     N, n = X.shape
-    problem = problem_of(g, lags, shortest(n, lags, given), most, np.zeros((0, n)))
+    problem = problem_of(g, lags, shortest(n, lags, given), most)
     found, _ = searched(X, y, problem)
     criteria = N * np.log(found.rss) + (n + 2) * np.log(N) * np.arange(most + 1)
     K = int(np.argmin(criteria))

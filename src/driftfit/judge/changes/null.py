@@ -75,10 +75,8 @@ class Tested(NamedTuple):
     p: float
     p_each: Array
     """(3,): of Nyblom's statistic, of one break, of two."""
-    L: Array
-    """(1 + 2 n,): Nyblom's statistic of all scores, of that of each parameter, and of the path of each estimate."""
-    p_path: Array
-    """(2 n,): p-values of the last two."""
+    L: float
+    """Nyblom's statistic."""
     gains: Array
     """(R, 2): gains of one and of two breaks of the draws."""
     ar: Array
@@ -164,8 +162,7 @@ class Draws:
         )  # fmt: skip
         signs = self.rng.integers(0, 2, (count, len(model.y))) * 2.0 - 1.0
         results = Results(
-            np.full((count, 3), np.inf), np.zeros((count, 1 + len(problem.paths))), np.zeros((count, n)),
-            np.zeros((count, len(ar))),
+            np.full((count, 3), np.inf), np.zeros(count), np.zeros((count, n)), np.zeros((count, len(ar))),
         )  # fmt: skip
         draw(way, signs, problem, int(whole), self.work, self.found, results)
         return results
@@ -208,12 +205,11 @@ def p_of(x: Array, drawn: Array) -> Array:
     return np.asarray(np.where(x <= ordered[-6], (1 + np.sum(drawn >= x, axis=0)) / (R + 1), tail))
 
 
-def price(drawn: Array, level: float) -> tuple[float, float]:
-    """What draws (R,) exceed with probability ``level``, which may be below 1 / R, and its standard error."""
+def price(drawn: Array, level: float) -> float:
+    """What draws (R,) exceed with probability ``level``, which may be below 1 / R."""
     R = len(drawn)
     top = np.sort(drawn)[-max(10, R // 10) :]
-    mean, reach = float(np.mean(top[1:] - top[0])), np.log(len(top) / (R + 1) / level)
-    return float(top[0] + mean * reach), float(mean * np.sqrt((1.0 + reach**2) / len(top)))
+    return float(top[0] + np.mean(top[1:] - top[0]) * np.log(len(top) / (R + 1) / level))
 
 
 def smallest(x: Array, drawn: Array) -> tuple[float, Array]:
@@ -233,11 +229,7 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     """The test of constancy, and the draws for further ones."""
     N, noise = len(model.y), model.noise
     first = order_of(noise.lags)
-    Z = model.X * noise.g[:, None]
-    paths = np.vstack([np.linalg.inv(model.basis).T, model.basis @ np.linalg.inv(Z.T @ Z)])
-    size = np.sqrt(np.sum((paths @ (Z.T @ Z)) * paths, axis=1))
-    paths /= np.maximum(size, SMALL)[:, None]
-    problem = problem_of(noise.g, noise.lags, noise.fewest, 2, paths, model.floor)
+    problem = problem_of(noise.g, noise.lags, noise.fewest, 2, model.floor)
     found, _ = searched(model.X, model.y, problem)
     held = noise.e.copy()
     Z, _ = white_rows(noise.rows, model.y, noise.lags, noise.ar, noise.g)
@@ -247,16 +239,16 @@ def tested(model: Model) -> tuple[Tested, Draws]:
     draws = Draws(model, problem, held)
     theta, ar = draws.constants = draws.unbiased(model.basis @ found.theta, found.ar[0])
     x = np.append(found.L[0], gains(found.rss[None], N)[0])
-    R, L = np.zeros((0, 2)), np.zeros((0, len(found.L)))
+    R = np.zeros((0, 3))
     for count in np.diff(DRAWS, prepend=0):
         drawn = draws.of(theta, ar, int(count), True)
-        fine = np.isfinite(drawn.L).all(axis=1) & np.isfinite(drawn.rss[:, 0])
-        R, L = np.vstack([R, gains(drawn.rss[fine], N)]), np.vstack([L, drawn.L[fine]])
-        p, each = smallest(x, np.column_stack([L[:, 0], R]))
+        fine = np.isfinite(drawn.L) & np.isfinite(drawn.rss[:, 0])
+        R = np.vstack([R, np.column_stack([drawn.L, gains(drawn.rss, N)])[fine]])
+        p, each = smallest(x, R)
         if p * len(R) > CLEAR or (p < SURE and len(R) >= DRAWS[1] - DRAWS[0]):
             break
     own, root = model.basis @ found.theta, draws.root(theta, ar)
-    return Tested(p, each, found.L, p_of(found.L[1:], L[:, 1:]), R, found.ar[0], own, root), draws
+    return Tested(p, each, float(found.L[0]), R[:, 1:], found.ar[0], own, root), draws
 
 
 def gains(rss: Array, N: int) -> Array:

@@ -65,12 +65,12 @@ def turned(n: int, phi: Array, basis: Array, X: Array) -> None:
 
 
 class Results(NamedTuple):
-    """What is found in R draws; sums of squares, Nyblom's statistics, or constants and their autoregressions."""
+    """What is found in R draws; sums of squares, Nyblom's statistic, or constants and their autoregressions."""
 
     rss: Array
     """(R, 3)"""
     L: Array
-    """(R, 1 + m)"""
+    """(R,)"""
     theta: Array
     """(R, n), in the basis, less those that were drawn from."""
     ar: Array
@@ -96,8 +96,8 @@ def draw(
             search(work.X, work.y, problem, work, found)
             for count in range(3 if R > 0 else 0):
                 results.rss[d, count] = found.rss[count]
-            for i in range(found.L.shape[0] if R > 0 else 0):
-                results.L[d, i] = found.L[i]
+            if R > 0:
+                results.L[d] = found.L[0]
             continue
         for i in range(results.ar.shape[1]):
             results.ar[d, i] = 0.0
@@ -111,7 +111,7 @@ def searched(X: Array, y: Array, problem: Problem) -> tuple[Found, Work]:
     N, n = X.shape
     rows, row, whole = np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0), np.int64)
     found, work = Found.of(n, problem), Work.of(N, n, problem)._replace(X=X, y=y)
-    none = Recursion(rows, rows, whole.ravel(), whole, rows, row, row, row, row), Results(rows, rows, rows, rows)
+    none = Recursion(rows, rows, whole.ravel(), whole, rows, row, row, row, row), Results(rows, row, rows, rows)
     draw(none[0], rows, problem, 1, work, found, none[1])
     return found, work
 

@@ -3,9 +3,9 @@
     y_t = x_t' theta_s + v_t,   v_t = sum a_l v_(t-l) + e_t / g_t         constant theta_s between two breaks
     Z, z = rows and outputs times g after whitening;  cost of rows i .. j = what constants leave of z_i .. z_j on Z
 
-Sums of products of [Z, z] before each of some places give the cost of any segment between two of them. The best
+Sums of products of [Z, z] before each row give the cost of any segment. The best
 partition with every number of breaks is found on cells (Bai and Perron, 2003, section 3; Jackson et al., 2005), and
-each break then moves to the best place within a cell, given its neighbours. Every number of breaks has its own
+each break then moves to the best row within a cell, given its neighbours. Every number of breaks has its own
 autoregression: it is estimated from the residuals of a first partition, and a second one is made with it, once from the
 noise of constants and once from white noise, since breaks and correlation explain the same residuals. After a break,
 lags of the noise are those of the new segment; `driftfit.judge.changes.dates` allows for the old one.
@@ -27,8 +27,6 @@ SINGULAR = 1e-9
 """Information below this share of that of the whole record is none."""
 CELLS = 32
 """Cells at whose ends breaks are compared."""
-FINER = 8
-"""Steps of a cell in which a break is moved, before it moves in single places."""
 ROUNDS = 5
 """Rounds of constants and their autoregression."""
 
@@ -42,19 +40,17 @@ class Problem(NamedTuple):
     """(p,) of whole numbers, ascending: lags of the autoregression."""
     edges: Array
     """(m + 1,): rows that bound cells, from 0 to N."""
-    paths: Array
-    """(m, n): combinations of scores for which Nyblom's statistic is returned beside that of all."""
     sizes: Array
     """(2,): fewest rows of a segment; largest number of breaks."""
     floor: Array
     """(1,): smallest sum of squares, that of rounding."""
 
 
-def problem_of(g: Array, lags: Array, fewest: int, most: int, paths: Array, floor: float = SMALL) -> Problem:
+def problem_of(g: Array, lags: Array, fewest: int, most: int, floor: float = SMALL) -> Problem:
     """The problem of a record with up to ``most`` breaks."""
     cells = min(max(len(g) // 8, 4), CELLS)
     edges = len(g) * np.arange(cells + 1) // cells
-    return Problem(g, lags, edges, np.ascontiguousarray(paths), np.array([fewest, most]), np.array([floor]))
+    return Problem(g, lags, edges, np.array([fewest, most]), np.array([floor]))
 
 
 class Work(NamedTuple):
@@ -66,11 +62,9 @@ class Work(NamedTuple):
     Z: Array
     v: Array
     C: Array
-    """(m + 1, n + 1, n + 1): sums of products of [Z, z] before every cell, lower triangles; the first is 0."""
+    """(N + 1, n + 1, n + 1): sums of products of [Z, z] before every row, lower triangles; the first is 0."""
     G: Array
-    low: Array
-    here: Array
-    high: Array
+    M: Array
     H: Array
     cost: Array
     best: Array
@@ -87,7 +81,7 @@ class Work(NamedTuple):
         """Empty space for one record."""
         p, K, m, k = len(problem.lags), int(problem.sizes[1]), len(problem.edges), n + 1
         shapes = (
-            (N, n), (N, n), (N,), (N, k), (N,), (m, k, k), (k, k), (k, k), (k, k), (k, k), (p + 1, p + 1), (m, m),
+            (N, n), (N, n), (N,), (N, k), (N,), (N + 1, k, k), (k, k), (k, k), (p + 1, p + 1), (m, m),
             (K + 1, m), (n,), (n,), (n,), (p,), (K + 1, p),
         )  # fmt: skip
         return cls._make([*map(np.zeros, shapes), np.zeros((K + 1, m), np.int64), np.zeros(K, np.int64)])
@@ -105,14 +99,14 @@ class Found(NamedTuple):
     theta: Array
     """(n,): constants."""
     L: Array
-    """(1 + m,): Nyblom's statistics."""
+    """(1,): Nyblom's statistic."""
 
     @classmethod
     def of(cls, n: int, problem: Problem) -> Found:
         """Nothing found yet."""
         p, K = len(problem.lags), int(problem.sizes[1])
-        at, L = np.zeros((K + 1, K), np.int64), np.zeros(1 + len(problem.paths))
-        return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), L)
+        at = np.zeros((K + 1, K), np.int64)
+        return cls(np.full(K + 1, np.inf), at, np.zeros((K + 1, p)), np.zeros(n), np.zeros(1))
 
 
 @sized
@@ -161,34 +155,12 @@ def remainder(X: Array, y: Array, first: int, last: int, work: Work) -> None:
 
 
 @sized
-def add(n: int, Z: Array, first: int, last: int, S: Array) -> None:
-    """Add the products of rows first .. last - 1 of Z (N, n + 1) to S, a lower triangle; two at a time take less."""
-    if (last - first) % 2 == 1:
+def cumulate(n: int, Z: Array, C: Array) -> None:
+    """C: sums of products of the rows of Z (N, n + 1) before every row."""
+    for t in range(Z.shape[0]):
         for i in range(n + 1):
             for j in range(i + 1):
-                S[i, j] += Z[first, i] * Z[first, j]
-    for t in range(first + (last - first) % 2, last, 2):
-        for i in range(n + 1):
-            for j in range(i + 1):
-                S[i, j] += Z[t, i] * Z[t, j] + Z[t + 1, i] * Z[t + 1, j]
-
-
-@shared
-def copy(S: Array, into: Array) -> None:
-    """Copy a lower triangle."""
-    for i in range(S.shape[0]):
-        for j in range(i + 1):
-            into[i, j] = S[i, j]
-
-
-@shared
-def before(problem: Problem, t: int, work: Work, S: Array) -> None:
-    """S: sums of products of [Z, z] before row t."""
-    m = 0
-    while m + 1 < problem.edges.shape[0] and problem.edges[m + 1] <= t:
-        m += 1
-    copy(work.C[m], S)
-    add(work.Z.shape[1] - 1, work.Z, problem.edges[m], t, S)
+                C[t + 1, i, j] = C[t, i, j] + Z[t, i] * Z[t, j]
 
 
 @sized
@@ -204,12 +176,11 @@ def cost(n: int, first: Array, last: Array, G: Array, least: float) -> float:
 @shared
 def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
     """Constants and their autoregression in turn; returns the sum of squares."""
-    rss, N = 0.0, X.shape[0]
+    rss, N, n = 0.0, X.shape[0], X.shape[1]
     for round in range(ROUNDS):
-        whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
-        copy(work.C[0], work.G)
-        add(work.Z.shape[1] - 1, work.Z, 0, N, work.G)
-        rss = eliminate(work.G, X.shape[1], 0.0)
+        whiten(n, X, y, problem.g, problem.lags, a, work.Z)
+        cumulate(n, work.Z, work.C)
+        rss = cost(n, work.C[0], work.C[N], work.G, 0.0)
         solved(work.G, work.theta)
         if a.shape[0] == 0:
             break
@@ -223,16 +194,14 @@ def settle(X: Array, y: Array, problem: Problem, a: Array, work: Work) -> float:
 def prepare(X: Array, problem: Problem, most: int, work: Work) -> float:
     """The best partitions of `whiten`'s rows on cells with up to ``most`` breaks; returns the information that is none.
     With the last of these only those of the whole record."""
-    edges, m, least = problem.edges, work.cost.shape[0], 0.0
-    for j in range(1, m):
-        copy(work.C[j - 1], work.C[j])
-        add(work.Z.shape[1] - 1, work.Z, edges[j - 1], edges[j], work.C[j])
-    for i in range(X.shape[1]):
-        least = max(least, SINGULAR * work.C[m - 1, i, i])
+    edges, m, n, least = problem.edges, work.cost.shape[0], X.shape[1], 0.0
+    cumulate(n, work.Z, work.C)
+    for i in range(n):
+        least = max(least, SINGULAR * work.C[X.shape[0], i, i])
     for j in range(1, m):
         for i in range(j):
             used = (most > 1 or i == 0 or j == m - 1) and edges[j] - edges[i] >= problem.sizes[0]
-            work.cost[i, j] = cost(X.shape[1], work.C[i], work.C[j], work.G, least) if used else np.inf
+            work.cost[i, j] = cost(n, work.C[edges[i]], work.C[edges[j]], work.G, least) if used else np.inf
         work.best[0, j] = work.cost[0, j]
     for count in range(1, most + 1):
         for j in range(1 if count < most else m - 1, m):
@@ -246,63 +215,48 @@ def prepare(X: Array, problem: Problem, most: int, work: Work) -> float:
 
 
 @shared
-def segment(problem: Problem, k: int, count: int, work: Work, least: float) -> float:
-    """What constants leave of segment k of those between ``at``; their factor is left in G."""
-    before(problem, work.at[k - 1] if k > 0 else 0, work, work.low)
-    before(problem, work.at[k] if k < count else work.Z.shape[0], work, work.high)
-    left: float = cost(work.Z.shape[1] - 1, work.low, work.high, work.G, least)
-    return left
-
-
-@shared
-def place(problem: Problem, count: int, work: Work, least: float) -> float:
+def place(n: int, problem: Problem, count: int, work: Work, least: float) -> float:
     """The rows ``at`` that begin segments of so many breaks, moved within cells; returns the sum of squares, inf
     without room."""
-    fewest, edges, at, low, here, high = problem.sizes[0], problem.edges, work.at, work.low, work.here, work.high
-    m, N, n, total = work.cost.shape[0] - 1, work.Z.shape[0], work.Z.shape[1] - 1, 0.0
+    fewest, edges, at, C, G = problem.sizes[0], problem.edges, work.at, work.C, work.G
+    m, N, reach, first, total = work.cost.shape[0] - 1, C.shape[0] - 1, edges[1] + 1, 0, 0.0
     if not work.best[count, m] < np.inf:
         return np.inf
     for k in range(count, 0, -1):
         m = work.back[k, m]
         at[k - 1] = edges[m]
-    wide = edges[1] - edges[0] + 1
     for move in range(2 * count):
         k = move if move < count else 2 * count - 1 - move
         begin, end = at[k - 1] if k > 0 else 0, at[k + 1] if k + 1 < count else N
-        before(problem, begin, work, low)
-        before(problem, end, work, high)
-        reach, by, most = wide, max(1, wide // FINER), np.inf
-        while by > 0:
-            t = max(at[k] - reach, begin + fewest)
-            last = min(at[k] + reach, end - fewest)
-            before(problem, t, work, here)
-            while t <= last:
-                value = cost(n, low, here, work.G, least) + cost(n, here, high, work.G, least)
-                if value < most:
-                    most = value
-                    at[k] = t
-                add(work.Z.shape[1] - 1, work.Z, t, t + by, here)
-                t += by
-            reach, by = by, 1 if by > 1 else 0
+        middle, most = at[k], np.inf
+        for t in range(max(middle - reach, begin + fewest), min(middle + reach, end - fewest) + 1):
+            value = cost(n, C[begin], C[t], G, least) + cost(n, C[t], C[end], G, least)
+            if value < most:
+                most = value
+                at[k] = t
     for k in range(count + 1):
-        total += segment(problem, k, count, work, least)
+        last = at[k] if k < count else N
+        total += cost(n, C[first], C[last], G, least)
+        first = last
     return total
 
 
 @shared
-def residuals(X: Array, y: Array, problem: Problem, count: int, work: Work, least: float) -> None:
+def residuals(X: Array, y: Array, count: int, work: Work, least: float) -> None:
     """v (N,) of the segments between ``at``."""
+    first = 0
     for k in range(count + 1):
-        segment(problem, k, count, work, least)
+        last = work.at[k] if k < count else X.shape[0]
+        cost(X.shape[1], work.C[first], work.C[last], work.G, least)
         solved(work.G, work.theta)
-        first, last = work.at[k - 1] if k > 0 else 0, work.at[k] if k < count else X.shape[0]
         remainder(X, y, first, last, work)
+        first = last
 
 
 @shared
-def keep(problem: Problem, count: int, work: Work, a: Array, least: float, found: Found) -> bool:
+def keep(n: int, problem: Problem, count: int, work: Work, a: Array, least: float, found: Found) -> bool:
     """Remember breaks that are better than those found before; whether there is room for any."""
-    rss = max(place(problem, count, work, least), problem.floor[0])
+    rss = max(place(n, problem, count, work, least), problem.floor[0])
     if rss < found.rss[count]:
         found.rss[count] = rss
         for b in range(count):
@@ -310,16 +264,6 @@ def keep(problem: Problem, count: int, work: Work, a: Array, least: float, found
         for i in range(a.shape[0]):
             found.ar[count, i] = a[i]
     return rss < np.inf  # type: ignore[no-any-return]
-
-
-@shared
-def form(w: Array, V: Array) -> float:
-    """w' V w of a lower triangle V."""
-    total = 0.0
-    for i in range(w.shape[0]):
-        for j in range(i + 1):
-            total += (2.0 if j < i else 1.0) * w[i] * w[j] * V[i, j]
-    return total
 
 
 @sized
@@ -342,29 +286,27 @@ def sums(n: int, Z: Array, theta: Array, S: Array, score: Array, V: Array, M: Ar
 
 
 @shared
-def nyblom(problem: Problem, work: Work, L: Array) -> None:
-    """L = sum S_t' V^-1 S_t / N of all scores, V their moments, and sum (w' S_t)^2 / (N w' V w) of every path w."""
-    N, n, V, M, score = work.Z.shape[0], work.theta.shape[0], work.G, work.low, work.score
+def nyblom(work: Work) -> float:
+    """sum S_t' V^-1 S_t / N of all scores, V their moments."""
+    N, n, V, M, score, L = work.Z.shape[0], work.theta.shape[0], work.G, work.M, work.score, 0.0
     sums(n, work.Z, work.theta, work.sums, score, V, M)
-    for k in range(1, L.shape[0]):
-        L[k] = form(problem.paths[k - 1], M) / (N * max(form(problem.paths[k - 1], V), SMALL))
     for i in range(n):
         V[i, i] += SINGULAR * V[i, i] + SMALL
     eliminate(V, n, 0.0)
     # the trace of V^-1 M, column by column of M
-    L[0] = 0.0
     for j in range(n):
         for i in range(n):
             V[n, i] = M[i, j] if i >= j else M[j, i]
             for k in range(i):
                 V[n, i] -= V[i, k] * V[n, k] * V[k, k]
         solved(V, score)
-        L[0] += score[j] / N
+        L += score[j] / N
+    return L
 
 
 @shared
 def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> None:
-    """Everything of one record: constants, Nyblom's statistics, the best partition with every number of breaks."""
+    """Everything of one record: constants, Nyblom's statistic, the best partition with every number of breaks."""
     p, K, a = found.ar.shape[1], problem.sizes[1], work.a
     for count in range(K + 1):
         found.rss[count] = np.inf
@@ -375,7 +317,7 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
         found.theta[i] = work.theta[i]
     for i in range(p):
         found.ar[0, i] = a[i]
-    nyblom(problem, work, found.L)
+    found.L[0] = nyblom(work)
     for start in range(2 if p > 0 else 1):
         for i in range(p):
             a[i] = found.ar[0, i] if start == 0 else 0.0
@@ -383,13 +325,13 @@ def search(X: Array, y: Array, problem: Problem, work: Work, found: Found) -> No
             whiten(X.shape[1], X, y, problem.g, problem.lags, a, work.Z)
         least, room = prepare(X, problem, K, work), K
         for count in range(1, K + 1):
-            if not keep(problem, count, work, a, least, found):
+            if not keep(X.shape[1], problem, count, work, a, least, found):
                 room = count - 1
                 break
             if p > 0:
-                residuals(X, y, problem, count, work, least)
+                residuals(X, y, count, work, least)
                 autoregression(work.v, problem.g, problem.lags, work.H, work.next[count])
         for count in range(1, room + 1 if p > 0 else 1):
             whiten(X.shape[1], X, y, problem.g, problem.lags, work.next[count], work.Z)
             least = prepare(X, problem, count, work)
-            keep(problem, count, work, work.next[count], least, found)
+            keep(X.shape[1], problem, count, work, work.next[count], least, found)

@@ -144,22 +144,20 @@ class Selection(Printed):
         names = self.pool.names if all(s.columns is not None for s in self.structures) else ()
         return averaged(list(self.structures), list(self.predictions), self.pool.y, self.judged, forgetting, names)
 
-    def switches(self, change: float = 0.001) -> list[Switch]:
-        """When the structure changed, with dates; ``change`` is the probability of a change at a sample.
+    def switches(self, level: float = 0.05) -> list[Switch]:
+        """When the structure changed, with dates; ``level`` is the probability of one where nothing changes.
 
         See `driftfit.judge.structures.switches`. ValueError for structures that are not made of the same regressors, or
-        a change that is not a probability below one half.
+        a level that is not a probability.
         """
-        if not 0.0 < change < 0.5:
-            raise ValueError(f"switches: change must be between 0 and 0.5; got {change!r}.")
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"switches: level must be between 0 and 1, such as 0.05; got {level!r}.")
         if any(one.columns is None for one in self.structures):
             raise ValueError("switches: structures must be columns of one regression, as those of ARX and Regression.")
         from driftfit.judge.structures.switches import switches
 
-        terms = np.stack([one.loglik for one in self.predictions], axis=1)
         columns = [list(one.columns or ()) for one in self.structures]
-        names = tuple(one.name for one in self.structures)
-        return switches(names, terms, self.pool.y, self.pool.phi, columns, change)
+        return switches([one.name for one in self.structures], self.pool.y, self.pool.phi, columns, level)
 
     @property
     def table(self) -> polars.DataFrame:
