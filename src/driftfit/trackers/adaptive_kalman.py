@@ -25,8 +25,8 @@ probabilities, of the variances with and without a jump in the last samples. The
 ruled out; that of a forecast has none after the last sample: it holds until theta jumps.
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
-Student's (`driftfit.trackers.student`). Every filter starts from generalised least squares with its own
-drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
+Student's (`driftfit.trackers.student`). All filters start from these least squares, in the directions that the
+regressors span.
 Scaling inputs or outputs changes only the units.
 
 ``volatility`` makes log r a random walk (`driftfit.trackers.forms.volatility`): the number of samples that tell of r,
@@ -81,7 +81,6 @@ from driftfit.trackers.mixture.filters import (
     weigh,
 )
 from driftfit.trackers.mixture.learned import (
-    begin_with_drift,
     colour,
     forecast_start,
     learn_colour,
@@ -117,10 +116,9 @@ def settle(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         for k in range(s.modes[l]):
             s.m[i, k, l] = s.d[i, l]
-            s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
+            s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
-    begin_with_drift(s, least_noise(s, l), l)
-    s.usual_noise[l] = s.r[l]
+    s.restless[l], s.usual_noise[l], s.remembered[l] = s.r[l], s.r[l], 0
 
 
 @partial(kernel, inline=False)
