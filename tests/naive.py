@@ -5,7 +5,7 @@ from scipy import stats
 
 from driftfit.trackers.mixture import filters
 from driftfit.trackers.mixture import states as of_noise
-from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
+from driftfit.trackers.mixture.filters import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
 
 
 def full(lower):

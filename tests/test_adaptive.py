@@ -5,7 +5,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.trackers.forms.excitation import learned, window
-from driftfit.trackers.mixture.states import COMMON
+from driftfit.trackers.mixture.filters import COMMON
 from lab import scenarios
 
 BURN = 200

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
+from driftfit.trackers.mixture.filters import ASSUMED, COMMON, DIRECTION, JUMPS, A, B, M, table
 from driftfit.trackers.mixture.learned import BLOCK, FADE, PHI, PRECISION, WINDOW, E
-from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, JUMPS, A, B, M, table
 
 
 def record(T=400, n=3, seed=0, walk=0.05):

@@ -71,7 +71,7 @@ class Without(AdaptiveKalman):
     piece: str = ""
 
     def state(self, n: int) -> Mapping[str, Any]:
-        from driftfit.trackers.mixture.states import table
+        from driftfit.trackers.mixture.filters import table
 
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:

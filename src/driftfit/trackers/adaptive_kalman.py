@@ -71,12 +71,21 @@ from driftfit.trackers.forms.excitation import (
 )
 from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.mixture.filters import (
-    centring,
+    FAR,
+    MEMORY,
+    MOST_ALONE,
+    OUTLYING,
+    STILL,
+    bank,
     enter_filters,
     innovate,
+    learn_noise,
+    least_noise,
     mix,
     mixture,
+    noise_prior,
     predict,
+    repeated_rounding,
     update_filters,
     weigh,
 )
@@ -91,19 +100,6 @@ from driftfit.trackers.mixture.learned import (
     take_start,
     whiten_noise,
 )
-from driftfit.trackers.mixture.states import (
-    MOST_ALONE,
-    OUTLYING,
-    SMOOTHER_FIELDS,
-    any_noise,
-    bank,
-    drift_ahead,
-    learn_noise,
-    least_noise,
-    noise_prior,
-    repeated_rounding,
-    store_for_smoother,
-)
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
 
 
@@ -112,7 +108,6 @@ def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
     s.r[l] = max(s.scale[l], least_noise(s, l))
     s.scale[l] = 1.0
-    s.settled[l] = 1
     for i in range(s.theta.shape[0]):
         for k in range(s.modes[l]):
             s.m[i, k, l] = s.d[i, l]
@@ -124,6 +119,7 @@ def settle(s: State, l: int) -> None:
 @partial(kernel, inline=False)
 def look_ahead(s: State, l: int) -> None:
     """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
+    frame(s, l)
     whiten_noise(s, l)
     column = whiten_within(s, s.white[:, l], l)
     noise_prior(s, l)
@@ -155,7 +151,8 @@ def follow(s: State, l: int) -> None:
 @kernel
 def forecast(s: State, l: int) -> None:
     """Of the filters, and of least squares until they start."""
-    if s.settled[l] > 0:
+    s.density[l] = np.nan
+    if s.restless[l] > 0.0:
         look_ahead(s, l)
     else:
         forecast_start(s, l)
@@ -164,7 +161,7 @@ def forecast(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         follow(s, l)
         return
     residuals = s.count[l]
@@ -185,7 +182,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def report(s: State, l: int) -> None:
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         mixture(s, l)
         if s.ok[l] > 0.0:
             located_within(s, l)
@@ -198,13 +195,49 @@ def report(s: State, l: int) -> None:
 def predict_moving(s: State, l: int) -> None:
     """As before, and log r walks: 2 / count <- 2 / count + volatility dt."""
     predict(s, l)
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         s.count[l] /= 1.0 + 0.5 * s.volatility[l] * s.dt[l] * s.count[l]
+
+
+SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "restless", "mean", "variance", "c")
+"""Fields that are stored at every sample."""
+
+
+@kernel
+def store_for_smoother(o: State, s: State, l: int) -> None:
+    """Store the fields of the smoother."""
+    for i in range(s.c.shape[0]):
+        o.white[i, l], o.mean[i, l], o.variance[i, l], o.c[i, l] = (
+            s.white[i, l],
+            s.mean[i, l],
+            s.variance[i, l],
+            s.c[i, l],
+        )
+    o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
+    o.explained[l], o.restless[l] = s.explained[l], s.restless[l]
 
 
 @kernel
 def keep_density(o: State, s: State, l: int) -> None:
     o.density[l] = s.density[l]
+
+
+def drift_ahead(rate: Array) -> Array:
+    """The mean of the rate (T,) over the next `MEMORY` samples."""
+    total, now = np.append(0.0, np.cumsum(rate)), np.arange(len(rate))
+    until = np.minimum(now + int(MEMORY), len(rate))
+    return np.asarray((total[until] - total[now]) / (until - now))
+
+
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
+    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
+    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
+    for k in np.flatnonzero(constant[-1])[-1:]:
+        mean = phi.mean(axis=0)
+        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
+    return A
 
 
 @dataclass(frozen=True)
@@ -236,10 +269,9 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away", "W",
+        "pivot", "H", "work", "at_start", "R", "W", "x", "white", "explained", "gain", "e_k", "step", "h_k", "curve",
+        "inverse", "joint", "share", "row", "walk", "Z", "away", "density", "drift_rate", "usual_noise",
     )  # fmt: skip
-    """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -266,13 +298,11 @@ class AdaptiveKalman(Tracker):
             "r": 1.0,
             "scale": np.nan,
             "count": 0.0,
-            "settled": 0,
             "vague": 0.0,
-            **knowing_nothing(n),
+            **{name: value for name, value in knowing_nothing(n).items() if name != "worst"},
             **no_excitation(n),
             **nothing_learned(n),
             **bank(n, self.groups),
-            **any_noise(),
             **({} if self.volatility is None else {"volatility": self.volatility}),
         }
 
@@ -296,19 +326,19 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
+        running = np.append(False, fields["restless"][:-1] > 0.0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
         n = phi.shape[1]
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
-        running = fields["settled"] > 0
+        running = fields["restless"] > 0.0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
         rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
         return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        if lane["settled"]:
+        if lane["restless"] > 0.0:
             lane["C"][:] += np.tril((lane["S"] * p) @ lane["S"].T)[..., None]
             np.einsum("ii->i", lane["P"])[:] += p
             lane["var"][:] += p
@@ -332,4 +362,4 @@ class AdaptiveKalman(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        return never & bool(lane["settled"] and lane["power_samples"] >= window(len(never)))
+        return never & bool(lane["restless"] > 0.0 and lane["power_samples"] >= window(len(never)))

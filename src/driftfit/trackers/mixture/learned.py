@@ -33,8 +33,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log, shared
 from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
-from driftfit.trackers.forms.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
-from driftfit.trackers.mixture.states import (
+from driftfit.trackers.forms.excitation import DULL, FIRST, LARGE, MEMORY, learn_information, learn_scales
+from driftfit.trackers.mixture.filters import (
     ASSUMED,
     DIRECTION,
     FIRST_ALONE,
@@ -75,7 +75,7 @@ LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi 
 def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
+        "mean": np.zeros(n), "variance": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + 2 * n)), "remembered": 0,
         "sums": np.eye(A + 6 * n, 1, -WEIGHT) * np.ones(n), 
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -89,12 +89,11 @@ def learn_means(s: State, l: int) -> None:
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
         own = s.variance[i, l]
-        moves = (s.moved[i, l] < 1.0) | (off * off > DULL * own * s.noise[l])
-        s.moved[i, l] += s.ok[l] if moves else 0.0
-        share = s.ok[l] / min(max(s.moved[i, l], 1.0), MEMORY) if moves else 0.0
+        moves = (s.active[i, l] <= 1.0) | (off * off > DULL * own * s.noise[l])
+        share = s.ok[l] / min(max(s.active[i, l], 1.0), MEMORY) if moves else 0.0
         s.mean[i, l] += share * off
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
-        most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
+        most = LARGE * own if s.active[i, l] > FIRST else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
 
 
