@@ -6,18 +6,15 @@
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
-| trend | as common; theta moves on along its slope | .001, .01, .1 |
+| trend | as common; theta moves on along its slope | .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
-| single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, 1, J |
-| group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
+| single i | 1 / c_i for parameter i alone (two to eight parameters), or for the parameters of a group | .003, .05, 1, J |
 
-J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y or the last
-outlier. It lasts for two samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter.
-They are merged after every sample (`driftfit.trackers.mixture.filters`).
-Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
-(`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
-(`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
-this tracker, and not here.
+J, the largest jump, is 1000, or e^2 / r where that is more. It lasts for two samples: then the filter goes on with the
+next smaller ratio. Every mode is a Kalman filter. They are merged after every sample. Noise is quiet, restless, or an
+outlier of any size, and coarse readings that repeat share their rounding (`driftfit.trackers.mixture.filters`). Scales,
+means, colour of the noise and covariance of the drift are learned (`driftfit.trackers.mixture.learned`). Readings are
+judged by a gate (`driftfit.readings.gate`), which is on for this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves. The variance before a sample is for samples that are no outliers: the geometric mean, by their
@@ -26,8 +23,7 @@ ruled out; that of a forecast has none after the last sample: it holds until the
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
 Student's (`driftfit.trackers.student`). All filters start from these least squares, in the directions that the
-regressors span.
-Scaling inputs or outputs changes only the units.
+regressors span. Scaling inputs or outputs changes only the units.
 
 ``volatility`` makes log r a random walk (`driftfit.trackers.forms.volatility`): the number of samples that tell of r,
 its memory and the degrees of freedom, falls between samples, 2 / count <- 2 / count + volatility dt.
@@ -36,7 +32,7 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 15 + 4 n for two to eight parameters, and 15 for more.
+sample: O(K n^2) for K modes; without groups K = 14 + 4 n for two to eight parameters, and 14 for more.
 """
 
 from __future__ import annotations
@@ -207,12 +203,8 @@ SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "restless"
 def store_for_smoother(o: State, s: State, l: int) -> None:
     """Store the fields of the smoother."""
     for i in range(s.c.shape[0]):
-        o.white[i, l], o.mean[i, l], o.variance[i, l], o.c[i, l] = (
-            s.white[i, l],
-            s.mean[i, l],
-            s.variance[i, l],
-            s.c[i, l],
-        )
+        o.white[i, l], o.c[i, l] = s.white[i, l], s.c[i, l]
+        o.mean[i, l], o.variance[i, l] = s.mean[i, l], s.variance[i, l]
     o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
     o.explained[l], o.restless[l] = s.explained[l], s.restless[l]
 

@@ -47,9 +47,9 @@ from driftfit.trackers.forms.covariance import LEFT
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
 JUMPS = max(COMMON)
-TREND = (1e-2,)
+TREND = (0.01, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
-ALONE, GROUP = (0.003, 0.05, 1.0, JUMPS), (1e-3, 1e-2, 0.1, 1.0, JUMPS)
+ALONE = (0.003, 0.05, 1.0, JUMPS)
 """Drift ratios of the ladders; that of jumps lasts for a few samples."""
 FLOOR = 0.002
 """Share of the common drift in the learned one."""
@@ -88,8 +88,8 @@ FAR = 9.0
 """Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
 STILL = 1e-24
 """Variance of a column, as a share of its mean square, below which it counts as constant: it may be rounding."""
-FADING, BEND = 0.005, 0.01
-"""Share of the slope that fades in an interval, and of the gain by which it is corrected."""
+FADING, BEND = 0.05, 0.1
+"""Slopes fade by this times the root of the ratio, and are corrected by that share of the gain."""
 STUDENT = 60.0
 """Samples from which on Student's density is taken for normal."""
 UNSURE = 3.0
@@ -106,7 +106,7 @@ def table(n: int, groups: Any) -> dict[str, Array]:
     """
     each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
     ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
-    ladders += [(g, ALONE if groups is None else GROUP) for g in range(len(each))]
+    ladders += [(g, ALONE) for g in range(len(each))]
     ratio = np.array([rho for _, ladder in ladders for rho in ladder])
     of = np.array([which for which, ladder in ladders for _ in ladder])
     jump, alone = ratio >= 1.0, of >= 0
@@ -135,7 +135,7 @@ def bank(n: int, groups: Any) -> dict[str, Any]:
         "mu": modes["start"],
         "m": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
-        "trend": np.zeros(n),
+        "trend": np.zeros((n, len(TREND))),
         "walk": np.zeros((2, n, n)),
         "Z": np.zeros((n, n)),
         "away": np.zeros((2, n)),
@@ -253,9 +253,11 @@ def predict(s: State, l: int) -> None:
             s.row[k, l] = size * s.ratio[k, l]
         wander(s, l)
         time = s.dt[l] * min(s.drift[l], 1.0)
-        for i in range(s.parameters[l]):
-            s.m[i, ALONG, l] += time * s.trend[i, l]
-            s.trend[i, l] /= 1.0 + FADING * time
+        for j in range(s.trend.shape[1]):
+            k = ALONG + j
+            for i in range(s.parameters[l]):
+                s.m[i, k, l] += time * s.trend[i, j, l]
+                s.trend[i, j, l] /= 1.0 + FADING * np.sqrt(s.ratio[k, l]) * time
 
 
 @partial(kernel, inline=False)
@@ -410,8 +412,10 @@ def update_filters(s: State, l: int) -> None:
         s.step[k, l] = a * s.e_k[k, l]
         s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
     absorb(s, l)
-    for i in range(s.parameters[l]):
-        s.trend[i, l] += BEND * s.step[ALONG, l] * s.gain[i, ALONG, l]
+    for j in range(s.trend.shape[1]):
+        k = ALONG + j
+        for i in range(s.parameters[l]):
+            s.trend[i, j, l] += BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l] * s.gain[i, k, l]
 
 
 @partial(kernel, inline=False)
@@ -450,7 +454,8 @@ def enter_filters(s: State, j: int, l: int) -> None:
     n, K = s.parameters[l], s.modes[l]
     noise = variance_in(s, 0, l) + s.vague[l]
     sign = new_row(s, s.white, j, l)
-    s.trend[j, l] = 0.0
+    for t in range(s.trend.shape[1]):
+        s.trend[j, t, l] = 0.0
     for k in range(K):
         for i in range(n):
             s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]
@@ -520,4 +525,5 @@ def mix(s: State, l: int) -> None:
     for a in range(n):
         for k in range(K):
             s.m[a, k, l] = s.d[a, l] + s.gain[a, k, l]
-        s.trend[a, l] *= s.step[ALONG, l]
+        for j in range(s.trend.shape[1]):
+            s.trend[a, j, l] *= s.step[ALONG + j, l]

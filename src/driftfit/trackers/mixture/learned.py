@@ -19,7 +19,8 @@ Coloured noise, y_t = phi_t' theta + v_t + c v_(t-1), is taken out by regressors
 y - c y*_(t-1); c is estimated by weighted least squares on the derivative of the prediction, bounded and shrunk.
 
 Source: scores are Koopman and Shephard's (1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung
-and Soderstrom (1983), section 3.7; the estimates from them are ours. Cost per sample: O(n^2), and O(n^3) at every `BLOCK`-th.
+and Soderstrom (1983), section 3.7; the estimates from them are ours. Cost per sample: O(n^2); O(n^3) at every
+`BLOCK`-th.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi 
 def nothing_learned(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "mean": np.zeros(n), "variance": np.zeros(n),
+        "mean": np.zeros(n), "variance": np.zeros(n), "moved": np.zeros(n),
         "samples": np.zeros((WINDOW, PHI + 2 * n)), "remembered": 0,
         "sums": np.eye(A + 6 * n, 1, -WEIGHT) * np.ones(n), 
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
@@ -89,11 +90,12 @@ def learn_means(s: State, l: int) -> None:
     for i in range(s.parameters[l]):
         off = s.phi[i, l] - s.mean[i, l]
         own = s.variance[i, l]
-        moves = (s.active[i, l] <= 1.0) | (off * off > DULL * own * s.noise[l])
-        share = s.ok[l] / min(max(s.active[i, l], 1.0), MEMORY) if moves else 0.0
+        moves = (s.moved[i, l] < 1.0) | (off * off > DULL * own * s.noise[l])
+        s.moved[i, l] += s.ok[l] if moves else 0.0
+        share = s.ok[l] / min(max(s.moved[i, l], 1.0), MEMORY) if moves else 0.0
         s.mean[i, l] += share * off
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
-        most = LARGE * own if s.active[i, l] > FIRST else np.inf
+        most = LARGE * own if s.moved[i, l] > FIRST else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
 
 
