@@ -125,12 +125,19 @@ PIECES: dict[str, Piece] = {
         functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
     ),
     "restless noise": Piece(edits=((BANK, "\nSTAY, CALM = 0.995, 0.98\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
-    "outliers": Piece(edits=((BANK, "RARITY, OFTEN = 0.035, 50.0, 1000.0", "RARITY, OFTEN = 1e-9, 1e12, 1000.0"),)),
-    "learned rate of outliers": Piece(edits=((BANK, "RARITY, OFTEN = 0.035, 50.0,", "RARITY, OFTEN = 0.035, 1e12,"),)),
+    "outliers": Piece(
+        edits=(
+            (BANK, "\nOUTLIER = 0.035\n", "\nOUTLIER = 1e-9\n"),
+            (LEARNED, "RARITY, OFTEN = 70.0, 2.0, 50.0,", "RARITY, OFTEN = 70.0, 2.0, 1e12,"),
+        )
+    ),
+    "learned rate of outliers": Piece(
+        edits=((LEARNED, "RARITY, OFTEN = 70.0, 2.0, 50.0,", "RARITY, OFTEN = 70.0, 2.0, 1e12,"),)
+    ),
     "repeated rounding": Piece(
         edits=(
             (BANK, "return s.alike[l] * min(", "return 0.0 * min("),
-            (BANK, "    if s.alike[l] > 0.0:\n        return\n", ""),
+            (LEARNED, "    if s.alike[l] > 0.0:\n        return\n", ""),
         ),
         functions=of(BANK, "repeated_rounding"),
     ),

@@ -8,7 +8,7 @@
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
 | trend | as common; theta moves on along its slope | .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
-| single i | 1 / c_i for parameter i alone (two to eight parameters), or for the parameters of a group | .003, .05, 1, J |
+| single i | 1 / c_i for parameter i alone (two to eight parameters), or for those of a group | .003, .05, 1, J |
 
 J, the largest jump, is 1000, or e^2 / r where that is more. It lasts for two samples: then the filter goes on with the
 next smaller ratio. Every mode is a Kalman filter. They are merged after every sample. Noise is quiet, restless, or an
@@ -68,14 +68,12 @@ from driftfit.trackers.forms.excitation import (
 from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.mixture.filters import (
     FAR,
-    MEMORY,
     MOST_ALONE,
     OUTLYING,
     STILL,
     bank,
     enter_filters,
     innovate,
-    learn_noise,
     least_noise,
     mix,
     mixture,
@@ -86,11 +84,13 @@ from driftfit.trackers.mixture.filters import (
     weigh,
 )
 from driftfit.trackers.mixture.learned import (
+    MEMORY_OF_R,
     colour,
     forecast_start,
     learn_colour,
     learn_drift,
     learn_means,
+    learn_noise,
     nothing_learned,
     start_density,
     take_start,
@@ -196,7 +196,8 @@ def predict_moving(s: State, l: int) -> None:
 
 
 SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "restless", "mean", "variance", "c")
-"""Fields that are stored at every sample."""
+"""Fields that are stored at every sample for the smoother (`driftfit.smooth.unknown_drift`): the drift r sum mu_k rho_k
+of rho_k < 1, the noise 1 / r_t = sum_j nu_tj / v_tj, signals without coloured noise, and means."""
 
 
 @kernel
@@ -215,9 +216,9 @@ def keep_density(o: State, s: State, l: int) -> None:
 
 
 def drift_ahead(rate: Array) -> Array:
-    """The mean of the rate (T,) over the next `MEMORY` samples."""
+    """The mean of the rate (T,) over the next `MEMORY_OF_R` samples."""
     total, now = np.append(0.0, np.cumsum(rate)), np.arange(len(rate))
-    until = np.minimum(now + int(MEMORY), len(rate))
+    until = np.minimum(now + int(MEMORY_OF_R), len(rate))
     return np.asarray((total[until] - total[now]) / (until - now))
 
 

@@ -9,15 +9,13 @@ interaction.
 with c_k the probability of mode k, a row of the table of `AdaptiveKalman`, and t the normal density, or Student's while
 the noise variance rests on few samples. The noise has one of three states, with probabilities nu_j:
 
-    quiet      variance r, the mean of E(v^2 | y) with a memory of `MEMORY` samples that are no outliers
-    restless   variance f: log f follows log E(v^2 | y, not quiet) with a memory of `QUICK` samples that are not quiet
-    outlier    of any size: variance max(30 r, e^2), with a probability that is learned
+    quiet      variance r
+    restless   variance f
+    outlier    of any size: variance max(30 r, e^2)
 
-With p the joint probabilities of modes and states, E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2), exactly; a noise
-variance that is learned so needs no bounds. Equal readings in a row repeat one error of rounding: the j-th has
-(j - 1) min(step^2 / 12, r) more noise, step being the smallest change of the readings, and r is learned from readings
-that changed. A meter so fine that readings never repeat has no such noise, and neither has a plant without noise whose
-readings repeat because it rests.
+Equal readings in a row repeat one error of rounding: the j-th has (j - 1) min(step^2 / 12, r) more noise, step being
+the smallest change of the readings. A meter so fine that readings never repeat has no such noise, and neither has a
+plant without noise whose readings repeat because it rests.
 
 Modes are merged by their moments after every sample, c_j = sum_i mu_i T_ij. T moves a mode down its ladder, and leads
 from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
@@ -28,9 +26,8 @@ The filters use coordinates z = M theta of their start, in which the regressor i
 .coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
 change their probabilities.
 
-Source: interacting multiple models are Blom and Bar-Shalom (1988); the moments of a noise given the data are those of
-an EM step, Shumway and Stoffer (1982); step^2 / 12 is Sheppard's (1898). Ladders, transitions and the rule for repeats
-are ours. Cost per sample: O(K n^2) for K modes.
+Source: interacting multiple models are Blom and Bar-Shalom (1988); step^2 / 12 is Sheppard's (1898). Ladders,
+transitions and the rule for repeats are ours. Cost per sample: O(K n^2) for K modes.
 """
 
 from __future__ import annotations
@@ -71,14 +68,12 @@ ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
 B, of M, of N and of two scratch matrices by turns."""
 OUTLYING, STATES = 2, 3
 """The last state of the noise, and their number."""
-OUTLIER, RARITY, OFTEN = 0.035, 50.0, 1000.0
-"""Probability of an outlier before the first sample, samples that this counts for, and memory of those since."""
+OUTLIER = 0.035
+"""Probability of an outlier before the first sample."""
 STAY, CALM = 0.995, 0.98
 """Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
 QUIET = 0.8
 """Probability of quiet noise before the first sample."""
-MEMORY, QUICK = 70.0, 2.0
-"""Memories of r and f, in samples."""
 LEAST_RESTLESS, LARGE = 6.0, 30.0
 """Least f and the variance of outliers at least, in units of r."""
 LEAST_SHARE = 1e-26
@@ -416,36 +411,6 @@ def update_filters(s: State, l: int) -> None:
         k = ALONG + j
         for i in range(s.parameters[l]):
             s.trend[i, j, l] += BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l] * s.gain[i, k, l]
-
-
-@partial(kernel, inline=False)
-def learn_noise(s: State, l: int) -> None:
-    """r and f from the moments of the noise of this sample."""
-    K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
-    usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
-    far = max(variance_in(s, OUTLYING, l), s.e[l] * s.e[l]) + more
-    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.nu[OUTLYING, l]) * usual + s.nu[OUTLYING, l] / far))
-    if s.alike[l] > 0.0:
-        return
-    ordinary, wild = 0.0, 0.0
-    for j in range(STATES):
-        least = variance_in(s, j, l)
-        widest = np.inf if j == OUTLYING else 0.0
-        for k in range(K):
-            e2, v = s.e_k[k, l] * s.e_k[k, l], s.inverse[j, k, l]
-            own = max(least, min(e2, widest))
-            s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
-        moment = sum_of_row(s, l) / s.noise[l]
-        ordinary += moment if j < OUTLYING else 0.0
-        wild += moment if j > 0 else 0.0
-    s.count[l] += 1.0
-    # s.nu counts an outlier for the states that were expected
-    away = 1.0 - s.nu[0, l] + s.nu[OUTLYING, l] * s.nu_prior[0, l] / (1.0 - s.nu_prior[OUTLYING, l])
-    f = variance_in(s, 1, l) / s.noise[l]
-    s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
-    s.nu_prior[OUTLYING, l] += (s.nu[OUTLYING, l] - s.nu_prior[OUTLYING, l]) / (RARITY + min(s.count[l], OFTEN))
-    move = (ordinary / s.r[l] - (1.0 - s.nu[OUTLYING, l])) / min(s.count[l] + 1.0, MEMORY)
-    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
 @partial(kernel, short=True)

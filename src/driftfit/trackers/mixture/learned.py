@@ -1,4 +1,12 @@
-"""What the bank learns beside theta, and its start: means of regressors, colour of noise, covariance of the drift.
+"""What the bank learns beside theta, and its start: the noise, means of regressors, the covariance of the drift.
+
+With p the joint probabilities of modes and states of the noise after a sample, the mean of v^2 given y,
+
+    E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2)
+
+is exact, and a noise variance that is learned from it needs no bounds: r is its mean over samples that are no outliers,
+with a memory of `MEMORY_OF_R`, and log f follows that of samples that are not quiet, with a memory of `QUICK`. Readings
+that repeat tell nothing of r. The probability of outliers is their share.
 
 The drift covariance Q, in units of r / (c_i c_j)^(1/2), is estimated from the scores of the disturbance smoother. With
 P the drift that the bank assumes, and e, 1 / s and k the innovation, its inverse variance and the gain of the mixture,
@@ -18,9 +26,9 @@ offset of any size thus have the same drift.
 Coloured noise, y_t = phi_t' theta + v_t + c v_(t-1), is taken out by regressors phi* = phi - c phi*_(t-1) and outputs
 y - c y*_(t-1); c is estimated by weighted least squares on the derivative of the prediction, bounded and shrunk.
 
-Source: scores are Koopman and Shephard's (1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung
-and Soderstrom (1983), section 3.7; the estimates from them are ours. Cost per sample: O(n^2); O(n^3) at every
-`BLOCK`-th.
+Source: the moments of the noise are those of an EM step, Shumway and Stoffer (1982); scores are Koopman and Shephard's
+(1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung and Soderstrom (1983), section 3.7; the
+estimates from them are ours. Cost per sample: O(n^2); O(n^3) at every `BLOCK`-th.
 """
 
 from __future__ import annotations
@@ -32,7 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, kernel, log, shared
+from driftfit.engine.kernel import Array, State, exp, kernel, log, shared
 from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
 from driftfit.trackers.forms.excitation import DULL, FIRST, LARGE, MEMORY, learn_information, learn_scales
 from driftfit.trackers.mixture.filters import (
@@ -45,6 +53,7 @@ from driftfit.trackers.mixture.filters import (
     SCORE,
     SHIFT,
     SLOPE,
+    STATES,
     WEIGHT,
     A,
     B,
@@ -52,9 +61,15 @@ from driftfit.trackers.mixture.filters import (
     N,
     T,
     V,
+    least_noise,
+    repeated_rounding,
     sum_of_row,
+    variance_in,
 )
 
+MEMORY_OF_R, QUICK, RARITY, OFTEN = 70.0, 2.0, 50.0, 1000.0
+"""Memories of r and f, in samples; samples that the first probability of outliers counts for, and memory of later
+ones."""
 BLOCK, WINDOW = 20, 40
 """Samples between two passes, and samples of a pass."""
 FADE = 0.985
@@ -82,6 +97,36 @@ def nothing_learned(n: int) -> dict[str, Any]:
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
         "colour_scores": np.zeros(3),
     }  # fmt: skip
+
+
+@partial(kernel, inline=False)
+def learn_noise(s: State, l: int) -> None:
+    """r and f from the moments of the noise of this sample."""
+    K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
+    usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
+    far = max(variance_in(s, OUTLYING, l), s.e[l] * s.e[l]) + more
+    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.nu[OUTLYING, l]) * usual + s.nu[OUTLYING, l] / far))
+    if s.alike[l] > 0.0:
+        return
+    ordinary, wild = 0.0, 0.0
+    for j in range(STATES):
+        least = variance_in(s, j, l)
+        widest = np.inf if j == OUTLYING else 0.0
+        for k in range(K):
+            e2, v = s.e_k[k, l] * s.e_k[k, l], s.inverse[j, k, l]
+            own = max(least, min(e2, widest))
+            s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
+        moment = sum_of_row(s, l) / s.noise[l]
+        ordinary += moment if j < OUTLYING else 0.0
+        wild += moment if j > 0 else 0.0
+    s.count[l] += 1.0
+    # s.nu counts an outlier for the states that were expected
+    away = 1.0 - s.nu[0, l] + s.nu[OUTLYING, l] * s.nu_prior[0, l] / (1.0 - s.nu_prior[OUTLYING, l])
+    f = variance_in(s, 1, l) / s.noise[l]
+    s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
+    s.nu_prior[OUTLYING, l] += (s.nu[OUTLYING, l] - s.nu_prior[OUTLYING, l]) / (RARITY + min(s.count[l], OFTEN))
+    move = (ordinary / s.r[l] - (1.0 - s.nu[OUTLYING, l])) / min(s.count[l] + 1.0, MEMORY_OF_R)
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
 
 
 @kernel
