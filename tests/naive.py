@@ -4,8 +4,7 @@ import numpy as np
 from scipy import stats
 
 from driftfit.trackers.mixture import filters
-from driftfit.trackers.mixture import states as of_noise
-from driftfit.trackers.mixture.states import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
+from driftfit.trackers.mixture.filters import COMMON, FIRST_ALONE, FIRST_LEARNED, FLOOR, JUMPS, OUTLYING
 
 
 def full(lower):
@@ -24,9 +23,9 @@ def walks(lane, jump=JUMPS):
     centred = moving & (c > (1.0 + filters.FAR) * v) & (len(constant) > 0)
     away[constant] -= np.where(centred, mean / mean[constant, None], 0.0)
     common = (away / np.where(centred, v, np.where(c > 0.0, c, np.inf))) @ away.T
-    a = np.divide(lane["sums"][of_noise.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
+    a = np.divide(lane["sums"][filters.DIRECTION], np.sqrt(c), out=np.zeros(n), where=c > 0.0)
     inverse = np.divide(1.0, c, out=np.zeros(n), where=c > 0.0)
-    learned = np.diag(lane["sums"][of_noise.WEIGHT] * inverse) + FLOOR * common + np.outer(a, a)
+    learned = np.diag(lane["sums"][filters.WEIGHT] * inverse) + FLOOR * common + np.outer(a, a)
     Q = np.zeros((len(rho), n, n))
     Q[:FIRST_LEARNED], Q[FIRST_LEARNED:FIRST_ALONE] = common, learned
     for i, (first, end) in enumerate(lane["alone"].T):
@@ -45,7 +44,7 @@ def before(lane, phi, jump=JUMPS):
     """x, means (n, K), covariances (K, n, n) and variances (3,) of the noise before a sample."""
     S, r = lane["S"], lane["r"]
     C = np.moveaxis(full(lane["C"]), -1, 0) + S @ walks(lane, jump) @ S.T
-    v = lane["noise"] * np.array([r, max(lane["restless"], of_noise.LEAST_RESTLESS * r), of_noise.LARGE * r])
+    v = lane["noise"] * np.array([r, max(lane["restless"], filters.LEAST_RESTLESS * r), filters.LARGE * r])
     return np.linalg.solve(S.T, phi), moved_along(lane), C, v
 
 
@@ -62,14 +61,14 @@ def expected(lane, phi):
 def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
-    square = (y - mean) ** 2 * ((y - mean) ** 2 > of_noise.LARGE * variance)
-    return before(lane, phi, max(JUMPS, min(max(lane["power"], lane["astray"]), square / lane["noise"]) / lane["r"]))
+    square = (y - mean) ** 2 * ((y - mean) ** 2 > filters.LARGE * variance)
+    return before(lane, phi, max(JUMPS, square / lane["noise"] / lane["r"]))
 
 
 def states(lane):
     """Probabilities (3,) of the states of the noise before a sample."""
     (quiet, restless, _), o = lane["nu"], lane["nu_prior"][OUTLYING]
-    usual = np.array([[of_noise.STAY, 1.0 - of_noise.STAY], [1.0 - of_noise.CALM, of_noise.CALM]])
+    usual = np.array([[filters.STAY, 1.0 - filters.STAY], [1.0 - filters.CALM, filters.CALM]])
     return np.append((1.0 - o) * np.array([quiet, restless]) @ usual, o)
 
 
@@ -105,7 +104,7 @@ def sample(lane, phi, y):
 def interaction(lane, mu, m, C):
     """The same after it, with the full matrix of transitions: down a ladder, or from anywhere to a mode."""
     ratio, arrive = lane["ratio"], lane["arrive"]
-    down = np.where(ratio < 1.0, of_noise.DOWN, np.where(ratio < JUMPS, of_noise.AFTER, of_noise.ENDS))
+    down = np.where(ratio < 1.0, filters.DOWN, np.where(ratio < JUMPS, filters.AFTER, filters.ENDS))
     down *= np.append(False, np.diff(ratio) > 0.0)
     T = np.diag(1.0 - down - arrive.sum()) + np.diag(down[1:], -1) + arrive
     share = mu[:, None] * T

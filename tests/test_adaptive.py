@@ -5,7 +5,7 @@ import pytest
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
 from driftfit.trackers.forms.excitation import learned, window
-from driftfit.trackers.mixture.states import COMMON
+from driftfit.trackers.mixture.filters import COMMON, FIRST_LEARNED
 from lab import scenarios
 
 BURN = 200
@@ -259,8 +259,7 @@ def test_a_slope_is_one_of_time_whatever_the_rows(rows):
         y[1::2] = np.nan
     kept = {"every second": time % 2 == 0, "uneven": rng.random(600) < 0.5}.get(rows, time >= 0.0)
     run = track(Regression(1), AdaptiveKalman(), y[kept], u[kept], time=time[kept])
-    follows = slice(len(COMMON), len(COMMON) + 3)
-    share = run.state["mu"][follows]
+    share = run.state["mu"][len(COMMON) : FIRST_LEARNED]
     slopes = run.state["trend"][0] / run.state["S"][0, 0]
     assert share.sum() > 0.5
     assert abs(slopes @ share / share.sum() - 0.02) < 0.01

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, AdaptiveKalman, Live, Regression, track
+from driftfit.trackers.mixture.filters import ASSUMED, COMMON, DIRECTION, JUMPS, A, B, M, table
 from driftfit.trackers.mixture.learned import BLOCK, FADE, PHI, PRECISION, WINDOW, E
-from driftfit.trackers.mixture.states import ASSUMED, COMMON, DIRECTION, JUMPS, A, B, M, table
 
 
 def record(T=400, n=3, seed=0, walk=0.05):
@@ -56,12 +56,12 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
 
 def test_the_table_of_modes():
     modes = table(4, None)
-    assert len(modes["ratio"]) == 15 + 4 * 4
+    assert len(modes["ratio"]) == 14 + 4 * 4
     assert modes["start"].sum() == pytest.approx(1.0)
     assert modes["arrive"][modes["ratio"] >= 1.0].sum() == pytest.approx(2e-3)
-    assert modes["alone"].tolist() == [[15, 19, 23, 27], [19, 23, 27, 31]]
+    assert modes["alone"].tolist() == [[14, 18, 22, 26], [18, 22, 26, 30]]
     assert (modes["ratio"][: len(COMMON)] == COMMON).all()
-    assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 15
+    assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 14
 
 
 def test_a_pass_of_scores_against_matrices():

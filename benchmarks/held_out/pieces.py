@@ -26,8 +26,7 @@ from driftfit.engine.kernel import Array
 
 HOME = Path(driftfit.__file__).parent
 ROOT = Path(__file__).parent.parent.parent
-BANK, STATES, LEARNED = (f"trackers/mixture/{name}.py" for name in ("filters", "states", "learned"))
-TRACKER = "trackers/adaptive_kalman.py"
+BANK, LEARNED = (f"trackers/mixture/{name}.py" for name in ("filters", "learned"))
 State = Mapping[str, Any]
 NEXT_TO_NEVER = 1e-30
 """Probability of entering a mode that is left out; at 0 its moments would be 0 / 0."""
@@ -71,7 +70,7 @@ class Without(AdaptiveKalman):
     piece: str = ""
 
     def state(self, n: int) -> Mapping[str, Any]:
-        from driftfit.trackers.mixture.states import table
+        from driftfit.trackers.mixture.filters import table
 
         state, piece, modes = dict(super().state(n)), PIECES[self.piece], table(n, self.groups)
         if piece.modes is not None:
@@ -114,8 +113,8 @@ PIECES: dict[str, Piece] = {
         edits=((LEARNED, "share = t[N + 6 * best, best] / positive if sound else 0.0", "share = 0.0"),),
         functions=of(LEARNED, "whitened", "rotate", "turn"),
     ),
-    "arrivals in all modes": Piece(edits=((STATES, "\nJUMP, DRIFT = 2e-3, 6e-4\n", "\nJUMP, DRIFT = 2e-3, 1e-9\n"),)),
-    "down the ladders": Piece(edits=((STATES, "\nDOWN, AFTER, ENDS = 1e-3,", "\nDOWN, AFTER, ENDS = 0.0,"),)),
+    "arrivals in all modes": Piece(edits=((BANK, "\nJUMP, DRIFT = 2e-3, 6e-4\n", "\nJUMP, DRIFT = 2e-3, 1e-9\n"),)),
+    "down the ladders": Piece(edits=((BANK, "\nDOWN, AFTER, ENDS = 1e-3,", "\nDOWN, AFTER, ENDS = 0.0,"),)),
     "jumps of any size": Piece(edits=((BANK, "    leaps = (size > 0.0) &", "    leaps = (size != size) &"),)),
     "Student's density": Piece(edits=((BANK, "\nSTUDENT = 60.0\n", "\nSTUDENT = 0.0\n"),)),
     "drift about means": Piece(
@@ -125,21 +124,22 @@ PIECES: dict[str, Piece] = {
         edits=((LEARNED, "s.colour[l] = max(-MOST, min(MOST, known))", "s.colour[l] = 0.0 * known"),),
         functions=of(LEARNED, "whiten_noise", "learn_colour", "colour"),
     ),
-    "restless noise": Piece(edits=((STATES, "\nSTAY, CALM = 0.995, 0.98\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
-    "outliers": Piece(edits=((STATES, "RARITY, OFTEN = 0.035, 50.0, 1000.0", "RARITY, OFTEN = 1e-9, 1e12, 1000.0"),)),
+    "restless noise": Piece(edits=((BANK, "\nSTAY, CALM = 0.995, 0.98\n", "\nSTAY, CALM = 1.0 - 1e-9, 1e-9\n"),)),
+    "outliers": Piece(
+        edits=(
+            (BANK, "\nOUTLIER = 0.035\n", "\nOUTLIER = 1e-9\n"),
+            (LEARNED, "RARITY, OFTEN = 70.0, 2.0, 50.0,", "RARITY, OFTEN = 70.0, 2.0, 1e12,"),
+        )
+    ),
     "learned rate of outliers": Piece(
-        edits=((STATES, "RARITY, OFTEN = 0.035, 50.0,", "RARITY, OFTEN = 0.035, 1e12,"),)
+        edits=((LEARNED, "RARITY, OFTEN = 70.0, 2.0, 50.0,", "RARITY, OFTEN = 70.0, 2.0, 1e12,"),)
     ),
     "repeated rounding": Piece(
         edits=(
-            (STATES, "return s.alike[l] * min(", "return 0.0 * min("),
-            (STATES, "    if s.alike[l] > 0.0:\n        return\n", ""),
+            (BANK, "return s.alike[l] * min(", "return 0.0 * min("),
+            (LEARNED, "    if s.alike[l] > 0.0:\n        return\n", ""),
         ),
-        functions=of(STATES, "repeated_rounding"),
-    ),
-    "start with drift": Piece(
-        edits=((TRACKER, "    begin_with_drift(s, least_noise(s, l), l)\n", ""),),
-        functions=of(LEARNED, "keep", "start_regressor", "run_again", "begin_with_drift"),
+        functions=of(BANK, "repeated_rounding"),
     ),
 }
 

@@ -44,7 +44,7 @@ Point = tuple[int, ...]
 SIZES = (15.0, 900.0)
 """Variances of jumps, in units of r / c; a group alone has their geometric mean."""
 PER_SAMPLE = 3e-3
-"""Probability of a jump before a sample, as in `driftfit.trackers.mixture.states`."""
+"""Probability of a jump before a sample, as in `driftfit.trackers.mixture.filters`."""
 LEVELS = (0.0, 1e-4, 1e-2, 1.0)
 EDGE = 10.0
 """The smallest ratio times T^2, and the largest."""

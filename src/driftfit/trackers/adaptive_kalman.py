@@ -6,18 +6,15 @@
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
-| trend | as common; theta moves on along its slope | .001, .01, .1 |
+| trend | as common; theta moves on along its slope | .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
-| single i | 1 / c_i for parameter i alone (two to eight parameters) | .003, .05, 1, J |
-| group g | 1 / c_i for the parameters of a group, instead of single | .001, .01, .1, 1, J |
+| single i | 1 / c_i for parameter i alone (two to eight parameters), or for those of a group | .003, .05, 1, J |
 
-J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y or the last
-outlier. It lasts for two samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter.
-They are merged after every sample (`driftfit.trackers.mixture.filters`).
-Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
-(`driftfit.trackers.mixture.states`). Scales, means, colour of the noise and covariance of the drift are learned
-(`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for
-this tracker, and not here.
+J, the largest jump, is 1000, or e^2 / r where that is more. It lasts for two samples: then the filter goes on with the
+next smaller ratio. Every mode is a Kalman filter. They are merged after every sample. Noise is quiet, restless, or an
+outlier of any size, and coarse readings that repeat share their rounding (`driftfit.trackers.mixture.filters`). Scales,
+means, colour of the noise and covariance of the drift are learned (`driftfit.trackers.mixture.learned`). Readings are
+judged by a gate (`driftfit.readings.gate`), which is on for this tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves. The variance before a sample is for samples that are no outliers: the geometric mean, by their
@@ -25,9 +22,8 @@ probabilities, of the variances with and without a jump in the last samples. The
 ruled out; that of a forecast has none after the last sample: it holds until theta jumps.
 
 The start is exact diffuse least squares without drift, until there are enough residuals to estimate r; its bands are
-Student's (`driftfit.trackers.student`). Every filter starts from generalised least squares with its own
-drift over the same samples (`driftfit.trackers.mixture.learned`), in the directions that the regressors span.
-Scaling inputs or outputs changes only the units.
+Student's (`driftfit.trackers.student`). All filters start from these least squares, in the directions that the
+regressors span. Scaling inputs or outputs changes only the units.
 
 ``volatility`` makes log r a random walk (`driftfit.trackers.forms.volatility`): the number of samples that tell of r,
 its memory and the degrees of freedom, falls between samples, 2 / count <- 2 / count + volatility dt.
@@ -36,7 +32,7 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 15 + 4 n for two to eight parameters, and 15 for more.
+sample: O(K n^2) for K modes; without groups K = 14 + 4 n for two to eight parameters, and 14 for more.
 """
 
 from __future__ import annotations
@@ -71,39 +67,34 @@ from driftfit.trackers.forms.excitation import (
 )
 from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.mixture.filters import (
-    centring,
+    FAR,
+    MOST_ALONE,
+    OUTLYING,
+    STILL,
+    bank,
     enter_filters,
     innovate,
+    least_noise,
     mix,
     mixture,
+    noise_prior,
     predict,
+    repeated_rounding,
     update_filters,
     weigh,
 )
 from driftfit.trackers.mixture.learned import (
-    begin_with_drift,
+    MEMORY_OF_R,
     colour,
     forecast_start,
     learn_colour,
     learn_drift,
     learn_means,
+    learn_noise,
     nothing_learned,
     start_density,
     take_start,
     whiten_noise,
-)
-from driftfit.trackers.mixture.states import (
-    MOST_ALONE,
-    OUTLYING,
-    SMOOTHER_FIELDS,
-    any_noise,
-    bank,
-    drift_ahead,
-    learn_noise,
-    least_noise,
-    noise_prior,
-    repeated_rounding,
-    store_for_smoother,
 )
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
 
@@ -113,19 +104,18 @@ def settle(s: State, l: int) -> None:
     """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
     s.r[l] = max(s.scale[l], least_noise(s, l))
     s.scale[l] = 1.0
-    s.settled[l] = 1
     for i in range(s.theta.shape[0]):
         for k in range(s.modes[l]):
             s.m[i, k, l] = s.d[i, l]
-            s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
+            s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
-    begin_with_drift(s, least_noise(s, l), l)
-    s.usual_noise[l] = s.r[l]
+    s.restless[l], s.usual_noise[l], s.remembered[l] = s.r[l], s.r[l], 0
 
 
 @partial(kernel, inline=False)
 def look_ahead(s: State, l: int) -> None:
     """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
+    frame(s, l)
     whiten_noise(s, l)
     column = whiten_within(s, s.white[:, l], l)
     noise_prior(s, l)
@@ -157,7 +147,8 @@ def follow(s: State, l: int) -> None:
 @kernel
 def forecast(s: State, l: int) -> None:
     """Of the filters, and of least squares until they start."""
-    if s.settled[l] > 0:
+    s.density[l] = np.nan
+    if s.restless[l] > 0.0:
         look_ahead(s, l)
     else:
         forecast_start(s, l)
@@ -166,7 +157,7 @@ def forecast(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         follow(s, l)
         return
     residuals = s.count[l]
@@ -187,7 +178,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def report(s: State, l: int) -> None:
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         mixture(s, l)
         if s.ok[l] > 0.0:
             located_within(s, l)
@@ -200,13 +191,46 @@ def report(s: State, l: int) -> None:
 def predict_moving(s: State, l: int) -> None:
     """As before, and log r walks: 2 / count <- 2 / count + volatility dt."""
     predict(s, l)
-    if s.settled[l] > 0:
+    if s.restless[l] > 0.0:
         s.count[l] /= 1.0 + 0.5 * s.volatility[l] * s.dt[l] * s.count[l]
+
+
+SMOOTHER_FIELDS = ("drift_rate", "usual_noise", "white", "explained", "restless", "mean", "variance", "c")
+"""Fields that are stored at every sample for the smoother (`driftfit.smooth.unknown_drift`): the drift r sum mu_k rho_k
+of rho_k < 1, the noise 1 / r_t = sum_j nu_tj / v_tj, signals without coloured noise, and means."""
+
+
+@kernel
+def store_for_smoother(o: State, s: State, l: int) -> None:
+    """Store the fields of the smoother."""
+    for i in range(s.c.shape[0]):
+        o.white[i, l], o.c[i, l] = s.white[i, l], s.c[i, l]
+        o.mean[i, l], o.variance[i, l] = s.mean[i, l], s.variance[i, l]
+    o.drift_rate[l], o.usual_noise[l] = s.drift_rate[l], s.usual_noise[l]
+    o.explained[l], o.restless[l] = s.explained[l], s.restless[l]
 
 
 @kernel
 def keep_density(o: State, s: State, l: int) -> None:
     o.density[l] = s.density[l]
+
+
+def drift_ahead(rate: Array) -> Array:
+    """The mean of the rate (T,) over the next `MEMORY_OF_R` samples."""
+    total, now = np.append(0.0, np.cumsum(rate)), np.arange(len(rate))
+    until = np.minimum(now + int(MEMORY_OF_R), len(rate))
+    return np.asarray((total[until] - total[now]) / (until - now))
+
+
+def centring(fields: Mapping[str, Array], phi: Array) -> Array:
+    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
+    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
+    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
+    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
+    for k in np.flatnonzero(constant[-1])[-1:]:
+        mean = phi.mean(axis=0)
+        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
+    return A
 
 
 @dataclass(frozen=True)
@@ -238,10 +262,9 @@ class AdaptiveKalman(Tracker):
     adapts: ClassVar[bool] = True
     gated: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
-        "pivot", "gain", "e_k", "step", "h_k", "curve", "inverse", "joint", "share", "row", "walk", "Z",
-        "away", "W",
+        "pivot", "H", "work", "at_start", "R", "W", "x", "white", "explained", "gain", "e_k", "step", "h_k", "curve",
+        "inverse", "joint", "share", "row", "walk", "Z", "away", "density", "drift_rate", "usual_noise",
     )  # fmt: skip
-    """Not H and work, which `driftfit.trackers.forms.coordinates.frame` fills only where the coordinates change."""
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -268,13 +291,11 @@ class AdaptiveKalman(Tracker):
             "r": 1.0,
             "scale": np.nan,
             "count": 0.0,
-            "settled": 0,
             "vague": 0.0,
-            **knowing_nothing(n),
+            **{name: value for name, value in knowing_nothing(n).items() if name != "worst"},
             **no_excitation(n),
             **nothing_learned(n),
             **bank(n, self.groups),
-            **any_noise(),
             **({} if self.volatility is None else {"volatility": self.volatility}),
         }
 
@@ -298,19 +319,19 @@ class AdaptiveKalman(Tracker):
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
-        running = np.append(False, fields["settled"][:-1] > 0)  # not yet at the sample with which the filters start
+        running = np.append(False, fields["restless"][:-1] > 0.0)  # not yet at the sample with which the filters start
         return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
 
     def problem(self, fields: Mapping[str, Array], phi: Array) -> tuple[Array, Array, Array, Sequence[Sequence[int]]]:
         n = phi.shape[1]
         groups = [[i] for i in range(n)] if self.groups is None and n <= MOST_ALONE else self.groups or ()
-        running = fields["settled"] > 0
+        running = fields["restless"] > 0.0
         noise = np.where(running, fields["usual_noise"], fields["usual_noise"][np.argmax(running)])
         rate = np.where(running, drift_ahead(fields["drift_rate"]), 0.0)
         return centring(fields, phi), noise, rate, groups
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        if lane["settled"]:
+        if lane["restless"] > 0.0:
             lane["C"][:] += np.tril((lane["S"] * p) @ lane["S"].T)[..., None]
             np.einsum("ii->i", lane["P"])[:] += p
             lane["var"][:] += p
@@ -334,4 +355,4 @@ class AdaptiveKalman(Tracker):
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        return never & bool(lane["settled"] and lane["power_samples"] >= window(len(never)))
+        return never & bool(lane["restless"] > 0.0 and lane["power_samples"] >= window(len(never)))

@@ -50,7 +50,7 @@ from driftfit.trackers.forms.diffuse import (
 )
 from driftfit.trackers.forms.diffuse import hand_over as choose_form
 from driftfit.trackers.forms.excitation import learn_scales
-from driftfit.trackers.mixture.states import LEAST_SHARE
+from driftfit.trackers.mixture.filters import LEAST_SHARE
 from driftfit.trackers.student import RESIDUALS, wider
 
 BASES = len(BASE_NAMES)

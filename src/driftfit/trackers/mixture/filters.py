@@ -1,14 +1,24 @@
-"""A bank of Kalman filters that differ in how the parameters drift: forecast, correction and interaction.
+"""A bank of Kalman filters that differ in how the parameters drift, and states of the noise: forecast, correction and
+interaction.
 
-    e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_kj
+    e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_j
     p_kj  proportional to c_k nu_j t(e_k; s_kj)
     a_k = sum_j p_(j|k) / s_kj,    d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with c_k and nu_j the probabilities of mode k and of state j of the noise (`driftfit.trackers.mixture.states`), and
-t the normal density, or Student's while the noise variance rests on few samples. Modes are merged by their moments
-after every sample, c_j = sum_i mu_i T_ij. T moves a mode down its ladder, and leads from the whole bank to mode j with
-the same small probability a_j, so that it costs O(K) instead of O(K^2):
+with c_k the probability of mode k, a row of the table of `AdaptiveKalman`, and t the normal density, or Student's while
+the noise variance rests on few samples. The noise has one of three states, with probabilities nu_j:
+
+    quiet      variance r
+    restless   variance f
+    outlier    of any size: variance max(30 r, e^2)
+
+Equal readings in a row repeat one error of rounding: the j-th has (j - 1) min(step^2 / 12, r) more noise, step being
+the smallest change of the readings. A meter so fine that readings never repeat has no such noise, and neither has a
+plant without noise whose readings repeat because it rests.
+
+Modes are merged by their moments after every sample, c_j = sum_i mu_i T_ij. T moves a mode down its ladder, and leads
+from the whole bank to mode j with the same small probability a_j, so that it costs O(K) instead of O(K^2):
 
     T_ij = a_j + down_i [j next below i],   the rest stays
 
@@ -16,39 +26,58 @@ The filters use coordinates z = M theta of their start, in which the regressor i
 .coordinates`). A regressor in a direction that no earlier one has determined is used by all filters, and does not
 change their probabilities.
 
-Source: interacting multiple models are Blom and Bar-Shalom (1988); ladders and transitions are ours. Cost per sample:
-O(K n^2) for K modes.
+Source: interacting multiple models are Blom and Bar-Shalom (1988); step^2 / 12 is Sheppard's (1898). Ladders,
+transitions and the rule for repeats are ours. Cost per sample: O(K n^2) for K modes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log
+from driftfit.readings.repeats import unread
 from driftfit.trackers.forms.coordinates import in_units_of_theta, new_row
 from driftfit.trackers.forms.covariance import LEFT
-from driftfit.trackers.mixture.states import (
-    AFTER,
-    COMMON,
-    DIRECTION,
-    DOWN,
-    DRIFT,
-    ENDS,
-    FIRST_ALONE,
-    FIRST_LEARNED,
-    FLOOR,
-    JUMP,
-    JUMPS,
-    LARGE,
-    OUTLYING,
-    STATES,
-    WEIGHT,
-    sum_of_row,
-    variance_in,
-)
+
+COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
+JUMPS = max(COMMON)
+TREND = (0.01, 0.1)
+LEARNED = (1e-3, 1e-2, 0.1, 1.0)
+ALONE = (0.003, 0.05, 1.0, JUMPS)
+"""Drift ratios of the ladders; that of jumps lasts for a few samples."""
+FLOOR = 0.002
+"""Share of the common drift in the learned one."""
+MOST_ALONE = 8
+"""Number of parameters up to which each has a ladder of its own."""
+JUMP, DRIFT = 2e-3, 6e-4
+"""Probabilities, from the whole bank: into all modes with ratios of 1 and more, and into all others."""
+DOWN, AFTER, ENDS = 1e-3, 0.05, 0.5
+"""Probabilities of the next smaller ratio of a ladder: of that from ratios of 1 and more, and from jumps."""
+AT_REST, ALL, SELDOM = 0.3, 0.45, 0.02
+"""Probabilities before the first sample: of no drift at least, of the other common ratios, and the share of jumps in
+these and those of the other ladders."""
+ALONG = len(COMMON)
+FIRST_LEARNED = ALONG + len(TREND)
+FIRST_ALONE = FIRST_LEARNED + len(LEARNED)
+"""Where the ladders begin."""
+ASSUMED, SLOPE, WEIGHT, DIRECTION, SCORE, SHIFT, A, B, M, N, T, V = range(12)
+"""Rows (n,) of the estimation: the diagonal of P, the right side, q, a, u, N k; then those of the sums of squares, of
+B, of M, of N and of two scratch matrices by turns."""
+OUTLYING, STATES = 2, 3
+"""The last state of the noise, and their number."""
+OUTLIER = 0.035
+"""Probability of an outlier before the first sample."""
+STAY, CALM = 0.995, 0.98
+"""Probabilities that quiet noise stays quiet, and that restless noise stays restless."""
+QUIET = 0.8
+"""Probability of quiet noise before the first sample."""
+LEAST_RESTLESS, LARGE = 6.0, 30.0
+"""Least f and the variance of outliers at least, in units of r."""
+LEAST_SHARE = 1e-26
+"""r is never below this share of the mean square of y, for rounding in the sums of a prediction."""
 
 FAR = 9.0
 """Square of the mean of a regressor, in units of its variance, from which on it drifts about the mean."""
@@ -65,15 +94,104 @@ LEAST = 1e-100
 """Probability that a mode is never below."""
 
 
-def centring(fields: Mapping[str, Array], phi: Array) -> Array:
-    """The matrix A (n, n) for which phi A are the regressors (N, n) less their means, where these are far from 0."""
-    c, v, A = fields["c"], fields["variance"], np.eye(phi.shape[1])
-    constant = (v <= STILL * c) & (fields["mean"] != 0.0)
-    beside = (c > (1.0 + FAR) * v) & (v > STILL * c) & constant.any(axis=1)[:, None]
-    for k in np.flatnonzero(constant[-1])[-1:]:
-        mean = phi.mean(axis=0)
-        A[k] = np.where(beside.any(axis=0), -mean / mean[k], A[k])
-    return A
+def table(n: int, groups: Any) -> dict[str, Array]:
+    """The modes as arrays (K,): ``ratio``; the ``ladder``, -3 common, -2 trend, -1 learned, or the number of a group;
+    probabilities ``arrive`` from the whole bank; and ``start``, before the first sample. And ``alone`` (2, n): the
+    first mode of the ladder in which a parameter drifts without all others, and the one after the last.
+    """
+    each = [[i] for i in range(n)] if groups is None and 1 < n <= MOST_ALONE else list(groups or ())
+    ladders = [(-3, COMMON), (-2, TREND), (-1, LEARNED)]
+    ladders += [(g, ALONE) for g in range(len(each))]
+    ratio = np.array([rho for _, ladder in ladders for rho in ladder])
+    of = np.array([which for which, ladder in ladders for _ in ladder])
+    jump, alone = ratio >= 1.0, of >= 0
+    arrive = np.where(jump, JUMP, DRIFT / np.sum(~jump))
+    for kind, share in ((alone, 0.5), (~alone, 0.5 if each else 1.0)):
+        arrive[jump & kind] *= share / max(int(np.sum(jump & kind)), 1)
+    start = np.where(of == -3, ALL / (len(COMMON) - 1), (1.0 - AT_REST - ALL) / np.sum(of != -3))
+    start[ratio >= 1.0] *= SELDOM
+    start[0] = 1.0 - start[1:].sum()
+    alone = np.zeros((2, n), int)
+    for g, members in enumerate(each):
+        alone[:, list(members)] = np.flatnonzero(of == g)[[0, -1], None] + [[0], [1]]
+    return {"ratio": ratio, "ladder": of, "arrive": arrive, "start": start, "alone": alone}
+
+
+def bank(n: int, groups: Any) -> dict[str, Any]:
+    """Fields of the K filters before the first sample: their modes, means m, covariances C (lower triangle); and of the
+    noise. f is 0 until the filters start.
+    """
+    modes = table(n, groups)
+    K = len(modes["ratio"])
+    return {
+        "modes": K,
+        "parameters": n,
+        **{name: modes[name] for name in ("ratio", "arrive", "alone")},
+        "mu": modes["start"],
+        "m": np.zeros((n, K)),
+        "C": np.zeros((n, n, K)),
+        "trend": np.zeros((n, len(TREND))),
+        "walk": np.zeros((2, n, n)),
+        "Z": np.zeros((n, n)),
+        "away": np.zeros((2, n)),
+        **{name: np.zeros(K) for name in ("e_k", "h_k", "step", "curve")},
+        "gain": np.zeros((n, K)),
+        "inverse": np.zeros((STATES, K)),
+        "joint": np.zeros((STATES, K)),
+        "row": np.zeros(K + 8),
+        "nu": np.array([QUIET, 1.0 - QUIET, 0.0]),
+        "nu_prior": np.array([0.0, 0.0, OUTLIER]),
+        "restless": 0.0,
+        "drift_rate": 0.0,
+        "usual_noise": 1.0,
+        **unread(),
+    }
+
+
+@partial(kernel, inline=False)
+def sum_of_row(s: State, l: int) -> float:
+    """Sum of the scratch row over the filters: in eight chains, none of which waits for the others."""
+    K = s.modes[l]
+    for k in range(K, K + 8):
+        s.row[k, l] = 0.0
+    a, b, c, d, e, f, g, h = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(0, K, 8):
+        a += s.row[k, l]
+        b += s.row[k + 1, l]
+        c += s.row[k + 2, l]
+        d += s.row[k + 3, l]
+        e += s.row[k + 4, l]
+        f += s.row[k + 5, l]
+        g += s.row[k + 6, l]
+        h += s.row[k + 7, l]
+    return ((a + b) + (c + d)) + ((e + f) + (g + h))
+
+
+@kernel
+def least_noise(s: State, l: int) -> float:
+    """The lower bound of r."""
+    return LEAST_SHARE * s.power[l]  # type: ignore[no-any-return]
+
+
+@kernel
+def variance_in(s: State, j: int, l: int) -> float:
+    """Variance of the noise of the sample in a state, for an outlier at least."""
+    r = s.r[l] if j == 0 else max(s.restless[l], LEAST_RESTLESS * s.r[l]) if j == 1 else LARGE * s.r[l]
+    return s.noise[l] * r  # type: ignore[no-any-return]
+
+
+@kernel
+def noise_prior(s: State, l: int) -> None:
+    """Probabilities of the states before the sample."""
+    usual = 1.0 - s.nu_prior[OUTLYING, l]
+    s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
+    s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
+
+
+@kernel
+def repeated_rounding(s: State, l: int) -> float:
+    """Variance that a repeated reading adds to its noise."""
+    return s.alike[l] * min(s.finest[l] * s.finest[l] / 12.0, s.noise[l] * s.r[l])  # type: ignore[no-any-return]
 
 
 @partial(kernel, inline=False)
@@ -102,12 +220,10 @@ def walks(s: State, l: int) -> None:
 
 
 @partial(kernel, inline=False)
-def wander(s: State, size: float, jump: float, l: int) -> None:
-    """Drift of all filters by ``size`` times their ratios, and by ``jump`` where these are jumps."""
+def wander(s: State, l: int) -> None:
+    """C_k += row_k Q_k for every mode."""
     n = s.parameters[l]
     walks(s, l)
-    for k in range(s.modes[l]):
-        s.row[k, l] = size * s.ratio[k, l] if s.ratio[k, l] < JUMPS else jump
     for a in range(n):
         for b in range(a + 1):
             for k in range(FIRST_LEARNED):
@@ -126,16 +242,17 @@ def wander(s: State, size: float, jump: float, l: int) -> None:
 @kernel
 def predict(s: State, l: int) -> None:
     """Drift and trends of the time since the last sample."""
-    if s.settled[l] > 0 and s.dt[l] > 0.0:
+    if s.restless[l] > 0.0 and s.dt[l] > 0.0:
         size = s.r[l] * s.dt[l] * s.drift[l]
-        wander(s, size, JUMPS * size, l)
+        for k in range(s.modes[l]):
+            s.row[k, l] = size * s.ratio[k, l]
+        wander(s, l)
         time = s.dt[l] * min(s.drift[l], 1.0)
         for j in range(s.trend.shape[1]):
-            k = len(COMMON) + j
-            fading = 1.0 / (1.0 + FADING * np.sqrt(s.ratio[k, l]) * time)
+            k = ALONG + j
             for i in range(s.parameters[l]):
                 s.m[i, k, l] += time * s.trend[i, j, l]
-                s.trend[i, j, l] *= fading
+                s.trend[i, j, l] /= 1.0 + FADING * np.sqrt(s.ratio[k, l]) * time
 
 
 @partial(kernel, inline=False)
@@ -236,11 +353,12 @@ def weigh(s: State, more: float, l: int) -> None:
     K = s.modes[l]
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
-    square = s.e[l] * s.e[l] / s.noise[l]
-    size = min(max(s.power[l], s.astray[l]), square) - JUMPS * s.r[l]
+    size = s.e[l] * s.e[l] / s.noise[l] - JUMPS * s.r[l]
     leaps = (size > 0.0) & (s.e[l] * s.e[l] > LARGE * s.s[l]) & (s.dt[l] * s.drift[l] > 0.0)
     if leaps:
-        wander(s, 0.0, size, l)
+        for k in range(K):
+            s.row[k, l] = size if s.ratio[k, l] == JUMPS else 0.0
+        wander(s, l)
         project(s, l)
         for k in range(K):
             s.e_k[k, l] = s.y[l] - s.explained[l] - s.e_k[k, l]
@@ -257,7 +375,6 @@ def weigh(s: State, more: float, l: int) -> None:
             s.joint[j, k, l] *= share
             s.row[k, l] = s.joint[j, k, l]
         s.nu[j, l] = sum_of_row(s, l)
-    s.astray[l] = s.nu[OUTLYING, l] * square
     # an outlier says nothing about the state of ordinary noise
     for j in range(OUTLYING):
         s.nu[j, l] += s.nu[OUTLYING, l] * s.nu_prior[j, l] / (1.0 - s.nu_prior[OUTLYING, l])
@@ -291,10 +408,9 @@ def update_filters(s: State, l: int) -> None:
         s.curve[k, l] = a - spread * s.e_k[k, l] * s.e_k[k, l]
     absorb(s, l)
     for j in range(s.trend.shape[1]):
-        k = len(COMMON) + j
-        share = BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l]
+        k = ALONG + j
         for i in range(s.parameters[l]):
-            s.trend[i, j, l] += share * s.gain[i, k, l]
+            s.trend[i, j, l] += BEND * np.sqrt(s.ratio[k, l]) * s.step[k, l] * s.gain[i, k, l]
 
 
 @partial(kernel, short=True)
@@ -317,12 +433,12 @@ def enter_filters(s: State, j: int, l: int) -> None:
 def mixture(s: State, l: int) -> None:
     """Mean d and reported covariance of the filters; without a sample d keeps its bits, and no large jump begins."""
     n, K = s.parameters[l], s.modes[l]
-    if (s.ok[l] == 0.0) & (s.dt[l] == 0.0):
-        return
     for k in range(K):
         s.row[k, l] = s.mu[k, l] * (s.ratio[k, l] if s.ratio[k, l] < 1.0 else 0.0)
         s.curve[k, l] = s.mu[k, l] if s.ok[l] > 0.0 or s.ratio[k, l] < JUMPS else max(s.mu[k, l] - s.arrive[k, l], 0.0)
     s.drift_rate[l] = s.r[l] * sum_of_row(s, l)
+    if (s.ok[l] == 0.0) & (s.dt[l] == 0.0):
+        return
     for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
@@ -375,4 +491,4 @@ def mix(s: State, l: int) -> None:
         for k in range(K):
             s.m[a, k, l] = s.d[a, l] + s.gain[a, k, l]
         for j in range(s.trend.shape[1]):
-            s.trend[a, j, l] *= s.step[len(COMMON) + j, l]
+            s.trend[a, j, l] *= s.step[ALONG + j, l]

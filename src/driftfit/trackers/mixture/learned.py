@@ -1,4 +1,12 @@
-"""What the bank learns beside theta, and its start: means of regressors, colour of noise, covariance of the drift.
+"""What the bank learns beside theta, and its start: the noise, means of regressors, the covariance of the drift.
+
+With p the joint probabilities of modes and states of the noise after a sample, the mean of v^2 given y,
+
+    E(v^2 | y) = sum p (r - r^2 / s + (r e / s)^2)
+
+is exact, and a noise variance that is learned from it needs no bounds: r is its mean over samples that are no outliers,
+with a memory of `MEMORY_OF_R`, and log f follows that of samples that are not quiet, with a memory of `QUICK`. Readings
+that repeat tell nothing of r. The probability of outliers is their share.
 
 The drift covariance Q, in units of r / (c_i c_j)^(1/2), is estimated from the scores of the disturbance smoother. With
 P the drift that the bank assumes, and e, 1 / s and k the innovation, its inverse variance and the gain of the mixture,
@@ -18,19 +26,9 @@ offset of any size thus have the same drift.
 Coloured noise, y_t = phi_t' theta + v_t + c v_(t-1), is taken out by regressors phi* = phi - c phi*_(t-1) and outputs
 y - c y*_(t-1); c is estimated by weighted least squares on the derivative of the prediction, bounded and shrunk.
 
-Filters that began from least squares without drift would be certain of something wrong where the parameters moved
-while the samples were collected. So each of the samples so far runs through all of them, from m = d and C = `LOOSE` I
-in units of r, in which least squares have C = I, so that next to nothing of this prior is left:
-
-    m_k, C_k,    S_k = sum e_k^2 / s_k,    log p_k = -1/2 sum log s_k - (nu / 2) log S_k
-
-with nu the number of residuals, and p_k Student's density of the samples given the drift of mode k, whatever r. The
-modes start with probabilities proportional to p_k, and with r the mean of S_k / nu.
-
-Source: scores are Koopman and Shephard's (1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung
-and Soderstrom (1983), section 3.7; the estimates from them are ours.
-Marginal likelihood under an inverse-gamma variance: West and Harrison, Bayesian Forecasting and Dynamic Models (1997),
-section 4.5. Cost per sample: O(n^2); O(K n^2) once more for each sample of the start.
+Source: the moments of the noise are those of an EM step, Shumway and Stoffer (1982); scores are Koopman and Shephard's
+(1992); recursive maximum likelihood for c is Soderstrom's (1973), see Ljung and Soderstrom (1983), section 3.7; the
+estimates from them are ours. Cost per sample: O(n^2); O(n^3) at every `BLOCK`-th.
 """
 
 from __future__ import annotations
@@ -44,19 +42,18 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log, shared
 from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
-from driftfit.trackers.forms.excitation import DULL, LARGE, MEMORY, learn_information, learn_scales
-from driftfit.trackers.mixture.filters import absorb, project, wander
-from driftfit.trackers.mixture.states import (
+from driftfit.trackers.forms.excitation import DULL, FIRST, LARGE, MEMORY, learn_information, learn_scales
+from driftfit.trackers.mixture.filters import (
     ASSUMED,
     DIRECTION,
     FIRST_ALONE,
     FIRST_LEARNED,
     FLOOR,
-    JUMPS,
     OUTLYING,
     SCORE,
     SHIFT,
     SLOPE,
+    STATES,
     WEIGHT,
     A,
     B,
@@ -64,9 +61,15 @@ from driftfit.trackers.mixture.states import (
     N,
     T,
     V,
+    least_noise,
+    repeated_rounding,
     sum_of_row,
+    variance_in,
 )
 
+MEMORY_OF_R, QUICK, RARITY, OFTEN = 70.0, 2.0, 50.0, 1000.0
+"""Memories of r and f, in samples; samples that the first probability of outliers counts for, and memory of later
+ones."""
 BLOCK, WINDOW = 20, 40
 """Samples between two passes, and samples of a pass."""
 FADE = 0.985
@@ -81,12 +84,6 @@ units of r."""
 COLOUR_FADE, SHRUNK, BOUND, MOST, GAP = 0.995, 5.0, 2.0, 0.95, 1.5
 """Fading of the sums for c; the square of its t value up to which noise is white; the bound of innovations in standard
 deviations; the largest c; and the interval that separates a sample from its past."""
-Y, SINCE = range(2)
-"""Those of a sample of the start: the output over the root of the noise factor,
-and intervals of drift since the one before. The regressor is over that root too."""
-LOOSE = 1e4
-"""Variance of each coordinate before the first sample, in units of what least squares leave. A larger one would cost
-as many digits of the estimates."""
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
@@ -102,6 +99,36 @@ def nothing_learned(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@partial(kernel, inline=False)
+def learn_noise(s: State, l: int) -> None:
+    """r and f from the moments of the noise of this sample."""
+    K, more = s.modes[l], s.vague[l] + repeated_rounding(s, l)
+    usual = s.nu[0, l] / (variance_in(s, 0, l) + more) + s.nu[1, l] / (variance_in(s, 1, l) + more)
+    far = max(variance_in(s, OUTLYING, l), s.e[l] * s.e[l]) + more
+    s.usual_noise[l] = 1.0 / (s.noise[l] * ((1.0 - s.nu[OUTLYING, l]) * usual + s.nu[OUTLYING, l] / far))
+    if s.alike[l] > 0.0:
+        return
+    ordinary, wild = 0.0, 0.0
+    for j in range(STATES):
+        least = variance_in(s, j, l)
+        widest = np.inf if j == OUTLYING else 0.0
+        for k in range(K):
+            e2, v = s.e_k[k, l] * s.e_k[k, l], s.inverse[j, k, l]
+            own = max(least, min(e2, widest))
+            s.row[k, l] = s.joint[j, k, l] * (own * (1.0 - own * v) + own * v * own * v * e2)
+        moment = sum_of_row(s, l) / s.noise[l]
+        ordinary += moment if j < OUTLYING else 0.0
+        wild += moment if j > 0 else 0.0
+    s.count[l] += 1.0
+    # s.nu counts an outlier for the states that were expected
+    away = 1.0 - s.nu[0, l] + s.nu[OUTLYING, l] * s.nu_prior[0, l] / (1.0 - s.nu_prior[OUTLYING, l])
+    f = variance_in(s, 1, l) / s.noise[l]
+    s.restless[l] = f * exp(away / QUICK * log(wild / (away * f))) if (away > 0.0) & (wild > 0.0) else f
+    s.nu_prior[OUTLYING, l] += (s.nu[OUTLYING, l] - s.nu_prior[OUTLYING, l]) / (RARITY + min(s.count[l], OFTEN))
+    move = (ordinary / s.r[l] - (1.0 - s.nu[OUTLYING, l])) / min(s.count[l] + 1.0, MEMORY_OF_R)
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), least_noise(s, l))
+
+
 @kernel
 def learn_means(s: State, l: int) -> None:
     """Means and variances of the regressors, over samples at which they move."""
@@ -113,7 +140,7 @@ def learn_means(s: State, l: int) -> None:
         share = s.ok[l] / min(max(s.moved[i, l], 1.0), MEMORY) if moves else 0.0
         s.mean[i, l] += share * off
         square = off * (s.phi[i, l] - s.mean[i, l]) / s.noise[l]
-        most = LARGE * own if s.moved[i, l] > 10.0 else np.inf
+        most = LARGE * own if s.moved[i, l] > FIRST else np.inf
         s.variance[i, l] += share * (min(square, most) - own)
 
 
@@ -361,18 +388,6 @@ def start_density(e: float, s: float, nu: float) -> float:
 
 
 @kernel
-def keep(s: State, l: int) -> None:
-    """Store a sample of the start, where those of the scores will be."""
-    if s.ok[l] > 0.0:
-        if s.remembered[l] < WINDOW:
-            at, root = s.remembered[l], 1.0 / math.sqrt(s.noise[l])
-            for i in range(s.theta.shape[0]):
-                s.samples[at, PHI + i, l] = root * s.phi[i, l]
-            s.samples[at, Y, l] = root * s.y[l]
-        s.remembered[l] += 1
-
-
-@kernel
 def forecast_start(s: State, l: int) -> None:
     """Prediction of least squares, and its variance in units of the noise so far."""
     forecast_on_roots(s, l)
@@ -382,8 +397,6 @@ def forecast_start(s: State, l: int) -> None:
 @partial(kernel, short=True)
 def take_start(s: State, l: int) -> None:
     """A sample of least squares, and its residual if the reading did not repeat the one before."""
-    if s.remembered[l] < WINDOW:
-        s.samples[s.remembered[l], SINCE, l] += s.dt[l] * s.drift[l]
     learn_scales(s, l)
     learn_means(s, l)
     learn_information(s, s.noise[l], l)
@@ -392,62 +405,4 @@ def take_start(s: State, l: int) -> None:
         sum_before = s.scale[l] * s.count[l] if s.count[l] > 0.0 else 0.0
         s.count[l] += s.ok[l]  # the scale is NaN until there is a residual
         s.scale[l] = (sum_before + s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])) / s.count[l]
-    keep(s, l)
-
-
-@kernel
-def start_regressor(s: State, at: int, l: int) -> None:
-    """x of a stored sample, which is in the span of the columns that are not free."""
-    for j in range(s.theta.shape[0]):
-        u = s.samples[at, PHI + j, l]
-        for i in range(j):
-            u -= s.S[i, j, l] * s.x[i, l]
-        s.x[j, l] = u / s.S[j, j, l] if s.S[j, j, l] > 0.0 else 0.0
-
-
-@kernel
-def run_again(s: State, l: int) -> None:
-    """Every filter over the stored samples, in units of r; sums of squares and of logs in ``joint``."""
-    n, K = s.theta.shape[0], s.modes[l]
-    for k in range(K):
-        s.joint[0, k, l], s.joint[1, k, l] = 0.0, 0.0
-    for i in range(n):
-        for k in range(K):
-            s.C[i, i, k, l] *= LOOSE
-    for at in range(s.remembered[l]):
-        if at > 0:
-            wander(s, s.samples[at, SINCE, l], JUMPS * s.samples[at, SINCE, l], l)
-        start_regressor(s, at, l)
-        project(s, l)
-        for k in range(K):
-            e, v = s.samples[at, Y, l] - s.e_k[k, l], s.h_k[k, l] + 1.0
-            s.joint[0, k, l] += e * e / v
-            s.joint[1, k, l] += log(v)
-            s.step[k, l], s.curve[k, l] = e / v, 1.0 / v
-        absorb(s, l)
-
-
-@partial(kernel, short=True)
-def begin_with_drift(s: State, least: float, l: int) -> None:
-    """Estimates, r, which is at least ``least``, and probabilities of the filters, which have m = d and C = I."""
-    n, K, count, nearest = s.theta.shape[0], s.modes[l], s.count[l], np.inf
-    if s.remembered[l] <= WINDOW:
-        run_again(s, l)
-        for k in range(K):
-            # residuals below the floor of r are rounding, and say nothing about the drift
-            s.step[k, l] = max(s.joint[0, k, l] / count, least)
-            s.curve[k, l] = s.joint[1, k, l] + count * log(s.step[k, l])
-            nearest = min(nearest, s.curve[k, l])
-        for k in range(K):
-            s.row[k, l] = s.mu[k, l] * exp(-0.5 * (s.curve[k, l] - nearest))
-        share = 1.0 / sum_of_row(s, l)
-        for k in range(K):
-            s.mu[k, l] = s.row[k, l] * share
-            s.row[k, l] = s.mu[k, l] * s.step[k, l]
-        s.r[l] = sum_of_row(s, l)
-    for i in range(n):
-        for j in range(i + 1):
-            for k in range(K):
-                s.C[i, j, k, l] *= s.r[l]
-    s.restless[l] = s.r[l]
-    s.remembered[l] = 0
+    s.remembered[l] += int(s.ok[l])
