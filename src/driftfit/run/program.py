@@ -23,11 +23,12 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, nothing
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
+from driftfit.engine.tracker_part import ROW
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.gate import AT_START, SIGNAL, Gate
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, start
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import ROW, First, begun, gate_of, judging, replayed
+from driftfit.run.gating import First, gate_of, judging, replayed
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -147,7 +148,8 @@ class Program:
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         if self.gate is None:
             return own
-        return {**own, **begun(self.gate, self.model, len(self.rows))}
+        n, m, shifts = self.model.n, self.model.m, self.model.linearised is not None
+        return {**own, **start(self.gate, n, m, shifts, len(self.rows))}
 
     @property
     def scratch(self) -> tuple[str, ...]:
@@ -259,7 +261,7 @@ class Program:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
         each = zip(self.trackers, self.model.outputs, strict=False)
         lanes = [replace(self, tracker=tracker, output=name) for tracker, name in each] or [self]
-        first = replayed(tile, self.model.m, ROW if self.rows else "")
+        first = replayed(tile, self.model.m, len(self.rows))
         fresh = tile_of(lanes, [{"gate_decided": np.array(1)}] * len(lanes))
         coded, out = first.codes.any(axis=1), self.written(fresh, len(first.y))
         self.drivers().run(fresh, *first.without_codes(), first.known, out)
