@@ -50,21 +50,6 @@ def seen_as(name: str, part: Any) -> Any:
 tracker_part = seen_as("tracker_part", _part)
 """tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
 
-ROW = "row_"
-"""Beginning of the names of fields (.., rows, 1) that a record of one lane has for several rows of an instant."""
-
-
-def _rows(record: Any) -> Any:
-    """The type of those fields with a row for a lane, (.., rows)."""
-    own = ((name.removeprefix(ROW), one) for name, one in record.fields.items() if name.startswith(ROW))
-    kinds = ((name, one, types.NestedArray(one.type.dtype, one.type.shape[:-1])) for name, one in own)
-    fields = [(name, {"type": kind, "offset": one.offset, "alignment": one.alignment}) for name, one, kind in kinds]
-    return types.Record(fields, record.size, record.aligned)
-
-
-rows_of = seen_as("rows_of", _rows)
-"""rows_of(s): the fields for several rows of an instant, without `ROW`, as a record with a lane for each."""
-
 
 @kernel
 def whole_record(s: State) -> State:

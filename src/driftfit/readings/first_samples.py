@@ -17,6 +17,7 @@ least squares on the others only q with nu residuals, and with k doubtful sample
 
     nu (Q - q) > WORSE k q
 
+or if the first sample that can be used does not respond to an outlying reading before it, which none predicts.
 Then the signals that made samples doubtful are marked, ``gate_replay`` is set, and the driver restores
 the state before the first sample and replays whole samples without the codes, once. Several outputs are kept together,
 each is judged by its own regression, and the samples are replayed without the codes of all.
@@ -164,7 +165,12 @@ def contradicted(g: State, l: int) -> bool:
                 spare, some = spare + (1 if sure else 0), some + (0 if sure else 1)
                 alone, more = alone + (square if sure else 0.0), more + (0.0 if sure else square)
                 total += y**2 if sure else 0.0
-    return (spare >= RESIDUALS) & (more * spare > WORSE * some * (alone + ROUNDED * total))  # type: ignore[no-any-return]
+    k, unexplained, last = 0, False, g.gate_doubt.shape[0] - 1
+    while (k < last) & (regressed(g, k, l) != regressed(g, k, l)):
+        unexplained |= g.gate_doubt[k, l] == 1.0
+        k += 1
+    unexplained &= g.gate_doubt[k, l] == 2.0
+    return (spare >= RESIDUALS) & (unexplained | (more * spare > WORSE * some * (alone + ROUNDED * total)))  # type: ignore[no-any-return]
 
 
 @partial(kernel, short=True)

@@ -41,10 +41,10 @@ import numpy as np
 from driftfit.engine.kernel import State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.settings import Settings, numbers, whole
-from driftfit.engine.tracker_part import ROW, rows_of, whole_record
+from driftfit.engine.tracker_part import whole_record
 from driftfit.readings.first_samples import bring, no_samples, remember
 from driftfit.readings.inputs import input_rules, no_inputs, taking_out
-from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unread, unresolved
+from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unresolved
 
 FIRST = 10.0
 """Readings after which a mean and a variance are known."""
@@ -54,8 +54,8 @@ CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
 """Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
-USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
-"""Reasons: what was decided of a sample."""
+USED, REFUSED, FROZEN, INPUT, AT_START, LIMITS = range(6)
+"""Reasons: what was decided of a sample; the last is no decision of a gate, but the user's."""
 SIGNAL = 8
 """A decision is a reason plus this many times the signal that it is about: 0 for the output, 1 + j for input j. Of
 several inputs it is the first."""
@@ -91,24 +91,14 @@ class Gate(Settings):
                 self._set(name, numbers("Gate", name, getattr(self, name), ndim=0, low=0.0))
 
 
-OF_SAMPLE = ("reason", "raw_y", "raw_e", "gate_decided", "gate_replay", "gate_refused", "shift", "floor")
-"""Fields of the sample, or of all outputs together: the others have an entry for each output."""
-
-
-def start(gate: Gate, n: int, m: int, shifts: bool = False, rows: int = 0) -> Mapping[str, Any]:
-    """Fields of the gate's state before the first sample, for n parameters and m inputs (`no_samples`), and for
-    ``rows`` outputs that share one theta."""
-    own = {
+def start(gate: Gate, n: int, m: int, shifts: bool = False) -> Mapping[str, Any]:
+    """Fields of the gate's state before the first sample, for n parameters and m inputs (`no_samples`)."""
+    return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
         "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
         "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0, "raw_e": np.nan,
         "gate_refused": 0, **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m, shifts),
     }  # fmt: skip
-    if rows == 0:
-        return own
-    several = ((name, np.asarray(one)[..., None]) for name, one in own.items() if name not in OF_SAMPLE)
-    each = {ROW + name: np.repeat(one, rows, axis=-1) for name, one in several}
-    return {"output": 0, **{name: own[name] for name in (*OF_SAMPLE, *unread())}, **each}
 
 
 @kernel
@@ -179,26 +169,14 @@ def output_rule(gate: Gate) -> Callable[[State, int, State, int, float], bool]:
     return judge  # type: ignore[no-any-return]
 
 
-@lru_cache(maxsize=256)
-def gate_step(
-    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
-    foresee: Step | None = None, rows: int = 0, m: int = 0,
-) -> Any:  # fmt: skip
-    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
-
-    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
-    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
-    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
-    e^2 takes the place of s, which the tracker does not have. Of ``rows`` outputs of m inputs that share one theta
-    every sample is of the next, ``s.output``, whose gate is a row. Rules take a sample as (s, l), and as (g, k) the
-    record and the lane of its gate: its own, or the row.
-    """
+def judge_of(gate: Gate, implicit: bool, lends: bool, foresee: Step | None) -> Any:
+    """``step(s, l, g, k)``, which decides whether the sample of lane l is used. Its gate is lane k of the record g: its
+    own, or of outputs that share one theta that of its output. Other arguments as for `gate_step`."""
     notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
     sure, rare, least = float(gate.sure) ** 2, float(gate.rare) ** 2, 0.0 if lends else 1.0
     far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
-    memory = rows_of if rows else whole_record
 
     @kernel
     def step(s: State, l: int, g: State, k: int) -> None:
@@ -227,10 +205,29 @@ def gate_step(
         learn(s, l, g, k, seen, contradicts, own, most)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
+    return step
+
+
+@lru_cache(maxsize=256)
+def gate_step(
+    gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
+    foresee: Step | None = None, rows: Any = None,
+) -> Any:  # fmt: skip
+    """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
+
+    All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
+    regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
+    predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
+    e^2 takes the place of s, which the tracker does not have. Of outputs that share one theta every sample is of
+    the next, ``s.output``; ``rows`` are (what finds the gates of all in a record, their number, signals of each).
+    """
+    memory, several, signals = rows or (whole_record, 0, 0)
+    step = judge_of(gate, implicit, lends, foresee)
+
     @partial(kernel, inline=False)
     def judges(s: State) -> None:
         g, k, L = memory(s), 0, s.reason.shape[0]
-        if rows:  # a constant, as below
+        if several:  # a constant, as below
             k = s.output[0]
         if s.gate_decided[0] < 1:
             for l in range(L):
@@ -239,12 +236,12 @@ def gate_step(
                 remember(s, g, s.reason[0], implicit)
         for l in range(L):
             step(s, l, g, k + l)
-        if rows:  # trackers read these of the output that was seen last
+        if several:  # trackers read these of the output that was seen last
             s.reading[0], s.alike[0], s.finest[0] = g.reading[k], g.alike[k], g.finest[k]
 
-    judge_all = judges if curved or rows else outlined(judges)
-    take_out = taking_out(refuse, SIGNAL, memory, rows)
-    refuse_all = take_out if rows else outlined(take_out, short=True)
+    judge_all = judges if foresee or several else outlined(judges)
+    take_out = taking_out(refuse, SIGNAL, memory, several)
+    refuse_all = take_out if several else outlined(take_out, short=True)
 
     @kernel
     def decide(s: State) -> None:
@@ -256,8 +253,8 @@ def gate_step(
             refused = max(refused, s.reason[l])
         if refused > 0:
             refuse_all(s)
-        if rows:  # a constant
-            s.reason[0] += SIGNAL * (1 + m) * s.output[0] if refused > 0 else 0
-            s.output[0] = (s.output[0] + 1) % rows
+        if several:  # a constant
+            s.reason[0] += SIGNAL * signals * s.output[0] if refused > 0 else 0
+            s.output[0] = (s.output[0] + 1) % several
 
     return decide

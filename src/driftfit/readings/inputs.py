@@ -40,12 +40,6 @@ def forget(g: State, j: int, k: int) -> None:
     g.gate_outside[j, k], g.gate_lowest[j, k], g.gate_highest[j, k] = 0, np.inf, -np.inf
 
 
-@kernel
-def widen(g: State, j: int, u: float, k: int) -> None:
-    """The range of input j takes in a value that was believed."""
-    g.gate_low[j, k], g.gate_high[j, k] = min(g.gate_low[j, k], u), max(g.gate_high[j, k], u)
-
-
 def input_rules(gate: Any) -> tuple[Any, Any]:
     """``notice(s, l, g, k, ages, known)``, which takes in the inputs of a sample if the model remembers those of
     ``ages`` others, and ``blame(g, k, contradicts, usual)``, the number of the first that is blamed for it, or 0.
@@ -55,17 +49,17 @@ def input_rules(gate: Any) -> tuple[Any, Any]:
     @kernel
     def notice(s: State, l: int, g: State, k: int, ages: int, known: bool) -> None:
         for j in range(g.gate_low.shape[0]):
-            if (g.gate_outside[j, k] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
-                widen(g, j, g.gate_lowest[j, k], k)
-                widen(g, j, g.gate_highest[j, k], k)
-                forget(g, j, k)
             u, low, high = s.u[j, l], g.gate_low[j, k], g.gate_high[j, k]
+            if (g.gate_outside[j, k] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
+                low, high = min(low, g.gate_lowest[j, k]), max(high, g.gate_highest[j, k])
+                forget(g, j, k)
             strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
             g.gate_outside[j, k] = (g.gate_outside[j, k] << 1) | (1 if strange else 0)
             if strange:
                 g.gate_lowest[j, k], g.gate_highest[j, k] = min(g.gate_lowest[j, k], u), max(g.gate_highest[j, k], u)
             elif abs(u) < np.inf:
-                widen(g, j, u, k)
+                low, high = min(low, u), max(high, u)
+            g.gate_low[j, k], g.gate_high[j, k] = low, high
 
     @kernel
     def blame(g: State, k: int, contradicts: bool, usual: bool) -> int:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
 
 from driftfit.data.record import Record
 from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.engine.phases import forecasting
-from driftfit.engine.tracker_part import ROW, tracker_part, whole_record
+from driftfit.engine.tracker_part import seen_as, tracker_part, whole_record
 from driftfit.models.base import Model
 from driftfit.readings.first_samples import CODES, DRIFT, DT, NOISE, READING, TIMES, U
-from driftfit.readings.gate import SIGNAL, Gate, gate_step
+from driftfit.readings.gate import AT_START, SIGNAL, Gate, gate_step, start
 from driftfit.readings.left_out import LeftOut
+from driftfit.readings.repeats import unread
 from driftfit.trackers.base import Tracker
 
 
@@ -48,23 +51,53 @@ def foreseeing(model: ModelSteps, tracker: TrackerSteps) -> Step | None:
     return model.foreseeing and model.foreseeing(forecast)
 
 
+ROW = "row_"
+"""Beginning of the names of fields (.., rows, 1) that a record of one lane has for several rows of an instant."""
+
+
+def _rows(record: Any) -> Any:
+    """The type of those fields with a row for a lane, (.., rows)."""
+    own = ((name.removeprefix(ROW), one) for name, one in record.fields.items() if name.startswith(ROW))
+    kinds = ((name, one, types.NestedArray(one.type.dtype, one.type.shape[:-1])) for name, one in own)
+    fields = [(name, {"type": kind, "offset": one.offset, "alignment": one.alignment}) for name, one, kind in kinds]
+    return types.Record(fields, record.size, record.aligned)
+
+
+rows_of = seen_as("rows_of", _rows)
+"""rows_of(s): the fields for several rows of an instant, without `ROW`, as a record with a lane for each."""
+
+OF_SAMPLE = ("reason", "raw_y", "raw_e", "gate_decided", "gate_replay", "gate_refused", "shift", "floor")
+"""Fields of the sample, or of all outputs together; of the others every output has its own."""
+
+
+def begun(gate: Gate, model: Model, rows: int) -> Mapping[str, Any]:
+    """Fields of a gate before the first sample, and of ``rows`` outputs that share one theta (0: they do not)."""
+    own = start(gate, model.n, model.m, model.linearised is not None)
+    if rows == 0:
+        return own
+    several = ((name, np.asarray(one)[..., None]) for name, one in own.items() if name not in OF_SAMPLE)
+    each = {ROW + name: np.repeat(one, rows, axis=-1) for name, one in several}
+    return {"output": 0, **{name: own[name] for name in (*OF_SAMPLE, *unread())}, **each}
+
+
 def judging(gate: Gate, model: Model, tracker: Tracker, steps: tuple[ModelSteps, TrackerSteps], rows: int) -> Any:
     """The gate as drivers take it, of so many outputs that share one theta (0: they do not)."""
     own, foresee = steps[0], None if tracker.output_error else foreseeing(*steps)
     implicit, lends = model.implicit is not None, not tracker.covariance
-    return gate_step(gate, own.ages, own.refuse, implicit, lends, foresee, rows, model.m)
+    return gate_step(gate, own.ages, own.refuse, implicit, lends, foresee, rows and (rows_of, rows, 1 + model.m))
 
 
-def left_out_of(program: Any, decided: Array, y: Array, ok: Array) -> LeftOut:
-    """The decisions in a run of a program, from what its gate stored for every sample (T,), its readings, and which
-    samples were used once all was decided."""
+def left_out_of(program: Any, decided: Array, y: Array, ok: Array, start: int) -> LeftOut:
+    """The decisions in a run of a program, from what its gate stored for every sample (T,), its readings, which samples
+    were used once all was decided, and the one at which the first were."""
     sample, names, ny = np.flatnonzero(decided), program.signals, len(program.rows) or 1
     signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
     refused = sample[signal % (len(names) // ny) == 0]
     after = (sample[:, None] + np.arange(program.model.steps.ages + 1)).ravel()
     after = np.setdiff1d(after[after < len(y)], refused)
     unused = after[~ok[after] & np.isfinite(y[after])]
-    return LeftOut(sample // ny, code, y[sample], np.array(names)[signal], refused, unused)
+    when = np.where(code == AT_START, start, sample) // ny
+    return LeftOut(sample // ny, code, y[sample], np.array(names)[signal], when, refused, unused)
 
 
 class First(NamedTuple):

@@ -23,12 +23,11 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import GATED, NOWHERE, Drivers, TrackerSteps, drivers
 from driftfit.engine.kernel import Array, nothing
 from driftfit.engine.tiles import OPEN, held_in, make_tile, output_record, output_type, repeat_tile
-from driftfit.engine.tracker_part import ROW
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.gate import AT_START, SIGNAL, Gate, start
+from driftfit.readings.gate import AT_START, SIGNAL, Gate
 from driftfit.run.columns import COLLECTED, collecting, put_columns
-from driftfit.run.gating import First, gate_of, judging, replayed
+from driftfit.run.gating import ROW, First, begun, gate_of, judging, replayed
 from driftfit.run.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -148,8 +147,7 @@ class Program:
         own = self.tracker.state_for(self.model if alone is None else alone.model)
         if self.gate is None:
             return own
-        n, m, shifts = self.model.n, self.model.m, self.model.linearised is not None
-        return {**own, **start(self.gate, n, m, shifts, len(self.rows))}
+        return {**own, **begun(self.gate, self.model, len(self.rows))}
 
     @property
     def scratch(self) -> tuple[str, ...]:
