@@ -39,6 +39,25 @@ def test_what_was_left_out_is_listed_and_a_stream_lists_the_same(codes):
     assert np.array_equal(live.theta, run.theta[99])
 
 
+@pytest.mark.parametrize("a", [0.9, 0.5])
+def test_a_first_reading_without_a_response_is_a_code(a):
+    """The plant rests with noise, of which a = 0 is no worse an explanation than a."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, y = rng.normal(size=T), np.zeros(T)
+        u[:100] = 0.0
+        for t in range(1, T):
+            y[t] = a * y[t - 1] + u[t - 1] + 0.05 * rng.normal()
+        y[0] = 9999.0
+        run = track(ARX(1, 1), RLS(1.0), y, u, gate=True)
+        assert run.left_out.sample.tolist() == [0]
+        assert run.theta[-1, 0] == pytest.approx(a, abs=0.02)
+        y[0] = 100.0
+        for t in range(1, 10):
+            y[t] += a**t * 100.0
+        assert left_out(track(ARX(1, 1), RLS(1.0), y, u, gate=True)) == 0  # a start that the plant forgets
+
+
 def test_a_large_response_to_a_large_input_is_kept():
     y, u = plant()
     rng = np.random.default_rng(1)

@@ -257,7 +257,8 @@ class Body(Statements):
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
             name = identifier(argument.arg)
             if one.kind in ("record", "tile"):
-                self.parameters += ["tracker_state *s", "scratch_fields *scratch"]
+                own = ["tracker_state *s", "scratch_fields *scratch"]
+                self.parameters += [text for text in own if text not in self.parameters]  # a gate's record is the same
                 named[argument.arg] = one
             elif one.kind in ("array", "address"):  # an address is one of real numbers
                 constant = "const " if one.kind == "array" and one.text == "u" else ""
@@ -324,6 +325,7 @@ class Body(Statements):
         function = translate(self.unit, source, arguments)
         self.ops[-1] += function.operations
         passed = [text for one in arguments if (text := as_argument(one))]
+        passed = [text for k, text in enumerate(passed) if text != RECORD or k == passed.index(RECORD)]
         if len(function.returns) > 1:
             names = [self.temporary(kind) for kind in function.returns]
             self.line(f"{function.name}({', '.join([*passed, *(f'&{name}' for name in names)])});")
@@ -337,10 +339,13 @@ class Body(Statements):
         return self.held(Value(function.returns[0], text))
 
 
+RECORD = "s, scratch"
+
+
 def as_argument(value: Value) -> str:
     """The expression passed for an argument; nothing if its value is known."""
     if value.kind in ("record", "tile"):
-        return "s, scratch"
+        return RECORD
     if value.kind in ("array", "address"):
         return begin_of(value)
     if value.kind == "items":

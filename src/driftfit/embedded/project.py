@@ -196,7 +196,7 @@ def files_of(program: Program, what: str, fixed_rate: bool, horizon: int | None)
     readme = filled(
         "README.md", what=as_code(what), names=", ".join(map(as_code, program.names)), doubles=made.layout(8).itemsize,
         singles=made.layout(4).itemsize, ops=_counted(made.entry.operations), ordinary=_after_the_start(made),
-        gate="" if program.gate is None else GATED % made.start["gate_first"].shape[1],
+        gate="" if program.gate is None else GATED % made.start["gate_doubt"].shape[1],
         control=_control(made, program, "control.md"),
     )  # fmt: skip
     return {

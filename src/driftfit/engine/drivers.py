@@ -175,7 +175,8 @@ class TrackerSteps(NamedTuple):
     (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
     compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that a
     call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the tracker
-    estimates, which a gate keeps above that of rounding. ``note`` precedes the correction; a gate takes its place.
+    estimates, which a gate keeps above that of rounding. Without a gate ``note(s, l, s, l)`` precedes the
+    correction.
     """
 
     predict: Step
@@ -194,7 +195,7 @@ class TrackerSteps(NamedTuple):
     reads_model: bool = False
     outlined: bool = False
     learns_scale: bool = False
-    note: Step = nothing
+    note: Any = nothing
 
 
 @kernel
@@ -328,7 +329,7 @@ def _written(common: bool, store: Any, keep_more: Any, part: Any) -> Any:
     return write
 
 
-def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, part: Any) -> Any:
+def _sample(model: ModelSteps, note: Any, phases: tuple[Any, ...], judge: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record. Between the regression and the lags
     are the ``phases`` of the tracker, one or two, and the gate after the first."""
     regress, push, notes, judged = model.regress, model.push, note is not nothing, judge is not None
@@ -348,7 +349,7 @@ def _sample(model: ModelSteps, note: Step, phases: tuple[Any, ...], judge: Any, 
             judge(s)
         if notes:  # a constant
             for l in range(L):
-                note(part(s), l)
+                note(part(s), l, part(s), l)  # as a gate, which has a record and a lane of its own
         last(part(s))
         for l in range(L):
             push(s, l)

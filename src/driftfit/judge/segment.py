@@ -40,7 +40,7 @@ from driftfit.judge.statistics.robust import orthonormal, pseudo_inverse
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
-from driftfit.run.track import in_rows_only
+from driftfit.run.track import run_quietly
 from driftfit.show.axes import BLUE, GREY, RED, date_axis, panels, time_label
 from driftfit.show.text import Printed, digits, table_of
 from driftfit.trackers.rls import RLS
@@ -209,7 +209,7 @@ def segment(
     if model is None:
         model = Regression(0 if u is None else None, intercept=True)
     data = record.pop("data", None)
-    run = in_rows_only(model, RLS(1.0), y, u, Reading(**record), data)
+    run = run_quietly(model, RLS(1.0), y, u, Reading(**record), data)
     if not isinstance(run, Track):
         raise ValueError(f"segment: give one series of one output at a time; got y={y!r}.")
     return segmented(run, level=level, false=false, shortest=shortest)

@@ -41,7 +41,8 @@ import numpy as np
 from driftfit.engine.kernel import State, Step, kernel, nothing
 from driftfit.engine.outlined import outlined
 from driftfit.engine.settings import Settings, numbers, whole
-from driftfit.readings.first_samples import no_samples, remember
+from driftfit.engine.tracker_part import whole_record
+from driftfit.readings.first_samples import bring, no_samples, remember
 from driftfit.readings.inputs import input_rules, no_inputs, taking_out
 from driftfit.readings.repeats import BELIEVED, frozen_rule, measured, natural, resolve, unresolved
 
@@ -53,8 +54,8 @@ CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
 """Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
-USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
-"""Reasons: what was decided of a sample."""
+USED, REFUSED, FROZEN, INPUT, AT_START, LIMITS = range(6)
+"""Reasons: what was decided of a sample; the last is no decision of a gate, but the user's."""
 SIGNAL = 8
 """A decision is a reason plus this many times the signal that it is about: 0 for the output, 1 + j for input j. Of
 several inputs it is the first."""
@@ -95,81 +96,82 @@ def start(gate: Gate, n: int, m: int, shifts: bool = False) -> Mapping[str, Any]
     return {
         "gate_count": 0.0, "gate_mean": 0.0, "gate_variance": 0.0, "gate_ratio": 1.0,
         "gate_run": 0, "gate_same": 0, "gate_pulses": 0, "gate_last": np.nan,
-        "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0,
-        **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m, shifts),
+        "gate_other": np.nan, "gate_stuck": 0.0, "gate_forecast": np.nan, "reason": 0, "raw_e": np.nan,
+        "gate_refused": 0, **unresolved(), **no_inputs(m), **no_samples(gate.first, n, m, shifts),
     }  # fmt: skip
 
 
 @kernel
-def learn(s: State, seen: bool, contradicts: bool, own: float, most: float, l: int) -> None:
+def learn(s: State, l: int, g: State, k: int, seen: bool, contradicts: bool, own: float, most: float) -> None:
     """Mean and variance of the readings, and the mean of e^2 / own, e^2 at ``most`` that, of the samples used."""
-    known, spread = s.gate_count[l] >= FIRST, s.gate_variance[l]
-    s.gate_count[l] += 1.0 if seen else 0.0
-    share = 1.0 / max(min(s.gate_count[l], MEMORY), 1.0)
+    known, spread = g.gate_count[k] >= FIRST, g.gate_variance[k]
+    g.gate_count[k] += 1.0 if seen else 0.0
+    share = 1.0 / max(min(g.gate_count[k], MEMORY), 1.0)
     if seen:
-        off = measured(s, l) - s.gate_mean[l]
+        off = measured(s, l) - g.gate_mean[k]
         if contradicts & known:
             clip = np.sqrt(CLIPPED * spread)
             off = min(max(off, -clip), clip)
-        s.gate_mean[l] += share * off
-        s.gate_variance[l] += share * ((1.0 - share) * off * off - spread)
+        g.gate_mean[k] += share * off
+        g.gate_variance[k] += share * ((1.0 - share) * off * off - spread)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
-        s.gate_ratio[l] += share * (min(s.e[l] * s.e[l], most) / own - s.gate_ratio[l])
+        g.gate_ratio[k] += share * (min(s.e[l] * s.e[l], most) / own - g.gate_ratio[k])
 
 
-def output_rule(gate: Gate) -> Callable[[State, float, int], bool]:
+def output_rule(gate: Gate) -> Callable[[State, int, State, int, float], bool]:
     """Refuse a far reading, unless it belongs to a change."""
     far, rare = float(gate.far) ** 2, float(gate.rare) ** 2
     sure, believed, change, hold = float(gate.sure) ** 2, gate.believed, 2 * gate.believed - 1, gate.hold
 
     @kernel
-    def held_back(s: State, y: float, unusual: bool, l: int) -> bool:
+    def held_back(g: State, k: int, y: float, unusual: bool) -> bool:
         """Whether a far reading is one of a code, or not yet enough of them are a change."""
-        unmoved, strikes = s.steps[l] == 0.0, s.gate_same[l] == 0
-        apart, apart_other = abs(abs(y) - abs(s.gate_last[l])), abs(abs(y) - abs(s.gate_other[l]))
-        near2 = far * s.gate_variance[l]
-        turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(s, l)))
+        unmoved, strikes = g.steps[k] == 0.0, g.gate_same[k] == 0
+        apart, apart_other = abs(abs(y) - abs(g.gate_last[k])), abs(abs(y) - abs(g.gate_other[k]))
+        near2 = far * g.gate_variance[k]
+        turns = (apart_other == 0.0) & ((apart * apart > near2) | (not natural(g, k)))
         if (apart == 0.0) | turns:
-            s.gate_same[l] += 1
-            s.gate_pulses[l] += 1 if unmoved & strikes else 0
-            moved = (s.gate_stuck[l] > 0.5) & (not natural(s, l))
-            return (s.gate_same[l] < (LONGER * hold if moved else hold)) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
-        alike = unmoved | ((y - s.gate_last[l]) ** 2 < near2)
-        s.gate_run[l] += 2
-        s.gate_pulses[l] = (s.gate_pulses[l] + 1 if alike else 1) if unusual | unmoved else 0
-        s.gate_other[l] = s.gate_last[l]
-        s.gate_last[l] = y
-        return (s.gate_run[l] < change) & (s.gate_pulses[l] < believed)  # type: ignore[no-any-return]
+            g.gate_same[k] += 1
+            g.gate_pulses[k] += 1 if unmoved & strikes else 0
+            moved = (g.gate_stuck[k] > 0.5) & (not natural(g, k))
+            return (g.gate_same[k] < (LONGER * hold if moved else hold)) & (g.gate_pulses[k] < believed)  # type: ignore[no-any-return]
+        alike = unmoved | ((y - g.gate_last[k]) ** 2 < near2)
+        g.gate_run[k] += 2
+        g.gate_pulses[k] = (g.gate_pulses[k] + 1 if alike else 1) if unusual | unmoved else 0
+        g.gate_other[k] = g.gate_last[k]
+        g.gate_last[k] = y
+        return (g.gate_run[k] < change) & (g.gate_pulses[k] < believed)  # type: ignore[no-any-return]
 
     @kernel
-    def judge(s: State, v: float, l: int) -> bool:
+    def judge(s: State, l: int, g: State, k: int, v: float) -> bool:
         """Whether the sample contradicts its forecast."""
         y, e2 = measured(s, l), s.e[l] * s.e[l]
-        off = y - s.gate_mean[l]
-        predicted, step = s.valid[l] > 0.0, s.finest[l] if s.steps[l] > 0.0 else 0.0
-        spread, response = max(s.gate_variance[l], step * step), s.y_hat[l] + s.shift[l] - s.gate_mean[l]
+        off = y - g.gate_mean[k]
+        predicted, step = s.valid[l] > 0.0, g.finest[k] if g.steps[k] > 0.0 else 0.0
+        spread, response = max(g.gate_variance[k], step * step), s.y_hat[l] + s.shift[l] - g.gate_mean[k]
         unusual = predicted & (response * response > rare * spread)
         beyond = off * off > far * (response * response if unusual else spread)
         contradicts = e2 > sure * v if predicted else beyond
         if not contradicts:
-            s.gate_run[l] = max(min(s.gate_run[l], 2 * change) - 1, 0)
-            if s.gate_same[l] > 0:  # a level that repeats is not frozen either
-                s.gate_stuck[l], s.gate_same[l] = BELIEVED, 0
-        elif beyond & (s.gate_count[l] >= FIRST):
-            if held_back(s, y, unusual, l):
+            g.gate_run[k] = max(min(g.gate_run[k], 2 * change) - 1, 0)
+            if g.gate_same[k] > 0:  # a level that repeats is not frozen either
+                g.gate_stuck[k], g.gate_same[k] = BELIEVED, 0
+        elif beyond & (g.gate_count[k] >= FIRST):
+            if held_back(g, k, y, unusual):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, REFUSED
             else:
-                s.gate_run[l] = 2 * change
-                s.gate_stuck[l] = BELIEVED if s.gate_same[l] > 0 else s.gate_stuck[l]
+                g.gate_run[k] = 2 * change
+                g.gate_stuck[k] = BELIEVED if g.gate_same[k] > 0 else g.gate_stuck[k]
         else:
-            s.gate_run[l] += 2
+            g.gate_run[k] += 2
         return contradicts  # type: ignore[no-any-return]
 
     return judge  # type: ignore[no-any-return]
 
 
-def judge_of(gate: Gate, implicit: bool = False, lends: bool = False, foresee: Step | None = None) -> Step:
-    """``step(s, l)``, which decides whether the sample of a lane is used; arguments as for `gate_step`."""
+def judge_of(gate: Gate, implicit: bool, lends: bool, foresee: Step | None) -> Any:
+    """``step(s, l, g, k)``, which decides whether the sample of lane l is used. Its gate is lane k of the record g: its
+    own, or of outputs that share one theta that of its output. Other arguments as for `gate_step`."""
     notice, blame = input_rules(gate)
     hold_frozen = frozen_rule(gate.frozen)
     judge = output_rule(replace(gate, rare=np.inf) if implicit and foresee is None else gate)
@@ -177,57 +179,69 @@ def judge_of(gate: Gate, implicit: bool = False, lends: bool = False, foresee: S
     far, curved, look = float(gate.far) ** 2, foresee is not None, foresee or nothing
 
     @kernel
-    def step(s: State, l: int) -> None:
+    def step(s: State, l: int, g: State, k: int) -> None:
         ages, s.reason[l] = s.reason[l], USED
         s.raw_e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
         seen = s.observed[l] > 0.0
-        notice(s, ages, s.gate_count[l] >= FIRST, l)
-        off, y_hat, e, variance = measured(s, l) - s.gate_mean[l], s.y_hat[l], s.e[l], s.s[l]
-        if curved and off * off > far * s.gate_variance[l]:
+        notice(s, l, g, k, ages, g.gate_count[k] >= FIRST)
+        off, y_hat, e, variance = measured(s, l) - g.gate_mean[k], s.y_hat[l], s.e[l], s.s[l]
+        if curved and off * off > far * g.gate_variance[k]:
             look(s, l)
         own = 1.0 if lends else s.s[l]
-        v = own * max(s.gate_ratio[l], least)
+        v = own * max(g.gate_ratio[k], least)
         contradicts = (s.ok[l] > 0.0) & (s.e[l] * s.e[l] > sure * v)
-        signal = blame(s, contradicts, off * off <= rare * s.gate_variance[l], l) if s.ok[l] > 0.0 else 0
+        signal = blame(g, k, contradicts, off * off <= rare * g.gate_variance[k]) if s.ok[l] > 0.0 else 0
         if signal > 0:
             s.ok[l], s.reason[l] = 0.0, INPUT + SIGNAL * signal
         if (s.observed[l] > 0.0) & (s.reason[l] == USED):
-            if hold_frozen(s, v, l) & (s.gate_same[l] == 0):
+            if hold_frozen(s, l, g, k, v) & (g.gate_same[k] == 0):
                 s.ok[l], s.observed[l], s.reason[l] = 0.0, 0.0, FROZEN
             else:
-                contradicts = judge(s, v, l)
-        resolve(s, l)
-        s.reading[l] = measured(s, l) if seen else s.reading[l]
+                contradicts = judge(s, l, g, k, v)
+        resolve(s, l, g, k)
+        g.reading[k] = measured(s, l) if seen else g.reading[k]
         # a start may claim any precision for a sample, but the first errors are all there is where none is claimed
-        most = np.inf if lends & (s.gate_count[l] < FIRST) else sure * v
-        learn(s, seen, contradicts, own, most, l)
+        most = np.inf if lends & (g.gate_count[k] < FIRST) else sure * v
+        learn(s, l, g, k, seen, contradicts, own, most)
         s.y_hat[l], s.e[l], s.s[l] = y_hat, e, variance
 
-    return step  # type: ignore[no-any-return]
+    return step
 
 
 @lru_cache(maxsize=256)
 def gate_step(
     gate: Gate, ages: int, refuse: Callable[[State, int, int, int], None], implicit: bool = False, lends: bool = False,
-    foresee: Step | None = None,
+    foresee: Step | None = None, rows: Any = None,
 ) -> Any:  # fmt: skip
     """The gate of a model which remembers an input for ``ages`` samples, until ``refuse`` makes it missing there.
 
     All models have one judge, which finds ``ages`` in s.reason and writes there why the sample is not used. The
     regressors of an ``implicit`` model contain the reading, so y_hat is no forecast of it: a code would be as large as
     predicted. There ``foresee(s, l)`` writes y_hat, e and s before a far reading is seen. With ``lends`` the mean of
-    e^2 takes the place of s, which the tracker does not have.
+    e^2 takes the place of s, which the tracker does not have. Of outputs that share one theta every sample is of
+    the next, ``s.output``; ``rows`` are (what finds the gates of all in a record, their number, signals of each).
     """
+    memory, several, signals = rows or (whole_record, 0, 0)
     step = judge_of(gate, implicit, lends, foresee)
 
     @partial(kernel, inline=False)
     def judges(s: State) -> None:
+        g, k, L = memory(s), 0, s.reason.shape[0]
+        if several:  # a constant, as below
+            k = s.output[0]
         if s.gate_decided[0] < 1:
-            remember(s, s.reason[0], implicit)
-        for l in range(s.reason.shape[0]):
-            step(s, l)
+            for l in range(L):
+                bring(s, l, g, k + l)
+            if k + L == g.gate_kept.shape[0]:
+                remember(s, g, s.reason[0], implicit)
+        for l in range(L):
+            step(s, l, g, k + l)
+        if several:  # trackers read these of the output that was seen last
+            s.reading[0], s.alike[0], s.finest[0] = g.reading[k], g.alike[k], g.finest[k]
 
-    judge_all, take_out = judges if foresee else outlined(judges), outlined(taking_out(refuse, SIGNAL), short=True)
+    judge_all = judges if foresee or several else outlined(judges)
+    take_out = taking_out(refuse, SIGNAL, memory, several)
+    refuse_all = take_out if several else outlined(take_out, short=True)
 
     @kernel
     def decide(s: State) -> None:
@@ -238,6 +252,9 @@ def gate_step(
         for l in range(s.reason.shape[0]):
             refused = max(refused, s.reason[l])
         if refused > 0:
-            take_out(s)
+            refuse_all(s)
+        if several:  # a constant
+            s.reason[0] += SIGNAL * signals * s.output[0] if refused > 0 else 0
+            s.output[0] = (s.output[0] + 1) % several
 
     return decide

@@ -35,64 +35,58 @@ def no_inputs(m: int) -> Mapping[str, Any]:
 
 
 @kernel
-def forget(s: State, j: int, l: int) -> None:
+def forget(g: State, j: int, k: int) -> None:
     """Nothing is outside any more."""
-    s.gate_outside[j, l], s.gate_lowest[j, l], s.gate_highest[j, l] = 0, np.inf, -np.inf
-
-
-@kernel
-def widen(s: State, j: int, u: float, l: int) -> None:
-    """The range of input j takes in a value that was believed."""
-    s.gate_low[j, l], s.gate_high[j, l] = min(s.gate_low[j, l], u), max(s.gate_high[j, l], u)
+    g.gate_outside[j, k], g.gate_lowest[j, k], g.gate_highest[j, k] = 0, np.inf, -np.inf
 
 
 def input_rules(gate: Any) -> tuple[Any, Any]:
-    """``notice(s, ages, known, l)``, which takes in the inputs of a sample if the model remembers those of ``ages``
-    others, and ``blame(s, contradicts, usual, l)``, the number of the first input that is blamed for it, from 1, or 0.
+    """``notice(s, l, g, k, ages, known)``, which takes in the inputs of a sample if the model remembers those of
+    ``ages`` others, and ``blame(g, k, contradicts, usual)``, the number of the first that is blamed for it, or 0.
     """
     away, trust = float(gate.away), gate.trust
 
     @kernel
-    def notice(s: State, ages: int, known: bool, l: int) -> None:
-        for j in range(s.gate_low.shape[0]):
-            if (s.gate_outside[j, l] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
-                widen(s, j, s.gate_lowest[j, l], l)
-                widen(s, j, s.gate_highest[j, l], l)
-                forget(s, j, l)
-            u, low, high = s.u[j, l], s.gate_low[j, l], s.gate_high[j, l]
+    def notice(s: State, l: int, g: State, k: int, ages: int, known: bool) -> None:
+        for j in range(g.gate_low.shape[0]):
+            u, low, high = s.u[j, l], g.gate_low[j, k], g.gate_high[j, k]
+            if (g.gate_outside[j, k] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
+                low, high = min(low, g.gate_lowest[j, k]), max(high, g.gate_highest[j, k])
+                forget(g, j, k)
             strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
-            s.gate_outside[j, l] = (s.gate_outside[j, l] << 1) | (1 if strange else 0)
+            g.gate_outside[j, k] = (g.gate_outside[j, k] << 1) | (1 if strange else 0)
             if strange:
-                s.gate_lowest[j, l], s.gate_highest[j, l] = min(s.gate_lowest[j, l], u), max(s.gate_highest[j, l], u)
+                g.gate_lowest[j, k], g.gate_highest[j, k] = min(g.gate_lowest[j, k], u), max(g.gate_highest[j, k], u)
             elif abs(u) < np.inf:
-                widen(s, j, u, l)
+                low, high = min(low, u), max(high, u)
+            g.gate_low[j, k], g.gate_high[j, k] = low, high
 
     @kernel
-    def blame(s: State, contradicts: bool, usual: bool, l: int) -> int:
+    def blame(g: State, k: int, contradicts: bool, usual: bool) -> int:
         first = 0
-        for j in range(s.gate_low.shape[0] - 1, -1, -1):
-            first = j + 1 if s.gate_outside[j, l] != 0 else first
-        if first == 0:
-            s.gate_blamed[l] = s.gate_blamed[l] if contradicts else 0
-            return 0
-        if not (contradicts & usual & (s.gate_blamed[l] < trust)):
-            return 0
-        s.gate_blamed[l] += 1
+        for j in range(g.gate_low.shape[0] - 1, -1, -1):
+            first = j + 1 if g.gate_outside[j, k] != 0 else first
+        g.gate_blamed[k] = g.gate_blamed[k] if contradicts | (first > 0) else 0
+        first = first if contradicts & usual & (g.gate_blamed[k] < trust) else 0
+        g.gate_blamed[k] += 1 if first > 0 else 0
         return first
 
     return notice, blame
 
 
-def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int) -> Any:
-    """``take_out(s)``: the model refuses inputs that were outside, if the reason is one, from ``blamed`` on."""
+def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int, memory: Any, rows: int) -> Any:
+    """``take_out(s)``: the model refuses inputs that were outside, if one is a reason, from ``blamed`` on."""
 
     @kernel
     def take_out(s: State) -> None:
+        g, k = memory(s), 0
+        if rows:  # a constant
+            k = s.output[0]
         for l in range(s.reason.shape[0]):
-            for j in range(s.gate_low.shape[0] if s.reason[l] >= blamed else 0):
+            for j in range(g.gate_low.shape[0] if s.reason[l] >= blamed else 0):
                 for age in range(LONGEST, -1, -1):
-                    if (s.gate_outside[j, l] >> age) & 1 > 0:
+                    if (g.gate_outside[j, k + l] >> age) & 1 > 0:
                         refuse(s, j, age, l)
-                forget(s, j, l)
+                forget(g, j, k + l)
 
     return take_out

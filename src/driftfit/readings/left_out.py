@@ -10,33 +10,37 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED
+from driftfit.readings.gate import AT_START, FROZEN, INPUT, LIMITS, REFUSED
 
 SAID: Mapping[int, tuple[str, str]] = {
     REFUSED: ("Left out", "far outside the range of the others, which the model did not predict"),
     FROZEN: ("Frozen", "repeating the one before although the forecast moved"),
     INPUT: ("Inputs left out", "with an input far outside its range to which the output did not respond"),
     AT_START: ("Left out at the start", "contradicted by the others among the first"),
+    LIMITS: ("Outside its limits", "outside the limits that were given"),
 }
 """For each reason its label in a summary, and what is said of the samples."""
+NONE = np.empty(0, int)
 KEPT = 16
 """Decisions that a stream keeps, and rows of a printed table at most."""
 
 
 class Decision(NamedTuple):
-    """One sample that was not used: its number (in a stream its time, if it has one), the signal, its reading of y, and
-    why."""
+    """One sample that was not used: its number (in a stream its time, if it has one), the signal, its reading of y,
+    why, and the sample at which that was decided."""
 
     sample: Any
     signal: str
     value: float
     reason: str
+    decided: Any
 
 
 @dataclass(frozen=True, repr=False)
 class LeftOut:
     """The decisions of a gate in the order of the samples: ``sample`` (k,), ``code`` (k,) of the reason
-    (`driftfit.readings.gate`), ``value`` (k,), the readings of y there, and ``signal`` (k,), the name of the signal.
+    (`driftfit.readings.gate`), ``value`` (k,), the readings of y there, ``signal`` (k,), the name of the signal, and
+    ``decided`` (k,), the sample at which it was decided.
     ``refused`` (i,) are the samples whose reading was refused, and ``unused`` (j,) those that could not be used because
     a refused input is in their regressors. Given as ``gate=``, these decisions are applied again.
     """
@@ -45,6 +49,7 @@ class LeftOut:
     code: Array
     value: Array
     signal: Array
+    decided: Array
     refused: Array
     unused: Array
 
@@ -52,9 +57,20 @@ class LeftOut:
         return len(self.sample)
 
     def __iter__(self) -> Iterator[Decision]:
-        columns = (one.tolist() for one in (self.sample, self.signal, self.value, self.code))
-        for sample, signal, value, code in zip(*columns, strict=True):
-            yield Decision(sample, signal, value, SAID[code][1])
+        columns = (one.tolist() for one in (self.sample, self.signal, self.value, self.code, self.decided))
+        for sample, signal, value, code, decided in zip(*columns, strict=True):
+            yield Decision(sample, signal, value, SAID[code][1], decided)
+
+    def beside(self, limits: LeftOut) -> LeftOut:
+        """These decisions, and the readings outside their limits in others."""
+        pairs = ((one, other[limits.code == LIMITS]) for one, other in zip(self._rows, limits._rows, strict=True))
+        columns = [np.concatenate(pair) for pair in pairs]
+        order = np.argsort(columns[0], kind="stable")
+        return LeftOut(*(one[order] for one in columns), self.refused, self.unused)
+
+    @property
+    def _rows(self) -> tuple[Array, ...]:
+        return self.sample, self.code, self.value, self.signal, self.decided
 
     @property
     def counts(self) -> dict[str, int]:
@@ -85,13 +101,12 @@ def table(decisions: Sequence[Decision]) -> str:
     return "\n".join([*lines, *more])
 
 
-NONE = np.empty(0, int)
-NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE)
+NOTHING_LEFT_OUT = LeftOut(NONE, NONE, np.empty(0), np.empty(0, "<U1"), NONE, NONE, NONE)
 
 
 def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str], ...]:
     """The lines on what was left out of a record, or of several together."""
     several = [found] if isinstance(found, LeftOut) else found.values()
     total = sum((Counter(one.counts) for one in several), Counter[str]())
-    rows = [(label, total[label], said) for label, said in SAID.values() if total[label]]
+    rows = [(label, total[label], said) for code, (label, said) in SAID.items() if total[label] and code != LIMITS]
     return tuple((label, f"{count} sample{'s' if count > 1 else ''} {said}: not used") for label, count, said in rows)

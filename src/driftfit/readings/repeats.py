@@ -68,71 +68,67 @@ def measured(s: State, l: int) -> float:
 
 
 @kernel
-def repeats_last(s: State, l: int) -> bool:
+def repeats_last(s: State, l: int, g: State, k: int) -> bool:
     """Whether the reading repeats the last one in all digits, but for the rounding of a shift."""
     y = measured(s, l)
-    return abs(y - s.reading[l]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
+    return abs(y - g.reading[k]) <= ROUNDING * (abs(y) + abs(s.shift[l]))  # type: ignore[no-any-return]
 
 
 @kernel
-def natural(s: State, l: int) -> bool:
+def natural(g: State, k: int) -> bool:
     """Whether so large a share of the readings repeat that a repeat is no sign of a code."""
-    repeats = s.repeats[l]
-    return (repeats >= ENOUGH) & (repeats >= SHARE * (repeats + s.steps[l]))  # type: ignore[no-any-return]
+    repeats = g.repeats[k]
+    return (repeats >= ENOUGH) & (repeats >= SHARE * (repeats + g.steps[k]))  # type: ignore[no-any-return]
 
 
 @kernel
-def note_reading(s: State, l: int) -> None:
+def note_reading(s: State, l: int, g: State, k: int) -> None:
     """Whether a reading repeats the last one, and the smallest step."""
     if s.observed[l] > 0.0:
-        step, repeated = abs(measured(s, l) - s.reading[l]), repeats_last(s, l)
-        s.alike[l] = s.alike[l] + 1.0 if repeated else 0.0
-        s.finest[l] = step if (not repeated) & (step < s.finest[l]) else s.finest[l]  # NaN at the first reading
-        s.reading[l] = measured(s, l)
+        step, repeated = abs(measured(s, l) - g.reading[k]), repeats_last(s, l, g, k)
+        g.alike[k] = g.alike[k] + 1.0 if repeated else 0.0
+        g.finest[k] = step if (not repeated) & (step < g.finest[k]) else g.finest[k]  # NaN at the first reading
+        g.reading[k] = measured(s, l)
 
 
 @kernel
-def resolve(s: State, l: int) -> None:
+def resolve(s: State, l: int, g: State, k: int) -> None:
     """Learn from a reading that was accepted, and set the floor."""
-    step, finest = abs(measured(s, l) - s.reading[l]), s.finest[l]
-    note_reading(s, l)
+    step, finest = abs(measured(s, l) - g.reading[k]), g.finest[k]
+    note_reading(s, l, g, k)
     if s.observed[l] > 0.0:
-        if s.alike[l] > 0.0:
-            s.repeats[l] += 1.0
+        if g.alike[k] > 0.0:
+            g.repeats[k] += 1.0
         elif step > 0.0:
-            s.steps[l] += 1.0
-            kept = s.smallest[l] if step >= 0.75 * finest else 0.0
-            s.smallest[l] = kept + (1.0 if step < 1.5 * finest else 0.0)
-        coarse = natural(s, l) & (s.smallest[l] >= max(ENOUGH, SHARE * s.steps[l]))
-        s.floor[l] = s.finest[l] * s.finest[l] / 12.0 if coarse else 0.0
+            g.steps[k] += 1.0
+            kept = g.smallest[k] if step >= 0.75 * finest else 0.0
+            g.smallest[k] = kept + (1.0 if step < 1.5 * finest else 0.0)
+    coarse = natural(g, k) & (g.smallest[k] >= max(ENOUGH, SHARE * g.steps[k]))
+    s.floor[l] = g.finest[k] * g.finest[k] / 12.0 if coarse else 0.0
 
 
-def frozen_rule(enter: float) -> Callable[[State, float, int], bool]:
-    """``frozen(s, v, l)``: whether the reading is one of a frozen sensor, given the variance v of its forecast."""
+def frozen_rule(enter: float) -> Callable[[State, int, State, int, float], bool]:
+    """``frozen(s, l, g, k, v)``: whether the sensor is frozen, given the variance v of the forecast."""
     enter = float(enter)
 
     @kernel
-    def chance_of_repeat(s: State, v: float, l: int) -> float:
-        """The probability at most that a sensor that works repeats its reading."""
-        quantum, repeats = s.finest[l], s.repeats[l]
-        off = max(abs(s.e[l]) - 0.5 * quantum, 0.0)
-        density = exp(-0.5 * off * off / v) / np.sqrt(2.0 * np.pi * v)
-        return min(max(repeats / (repeats + s.steps[l]), quantum * density), 1.0)  # type: ignore[no-any-return]
-
-    @kernel
-    def frozen(s: State, v: float, l: int) -> bool:
-        found, repeats = 0.0, repeats_last(s, l)
-        if repeats & (s.gate_stuck[l] < 0.0):
+    def frozen(s: State, l: int, g: State, k: int, v: float) -> bool:
+        found, repeats = 0.0, repeats_last(s, l, g, k)
+        if repeats & (g.gate_stuck[k] < 0.0):
             found = BELIEVED
-        elif repeats & (s.steps[l] >= 2.0 * ENOUGH):
-            prior = enter * (1.0 - s.gate_stuck[l]) + STAY * s.gate_stuck[l]
-            quantum, tells = s.finest[l], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
-            moved = s.y_hat[l] + s.shift[l] - s.gate_forecast[l]
+        elif repeats & (g.steps[k] >= 2.0 * ENOUGH):
+            prior = enter * (1.0 - g.gate_stuck[k]) + STAY * g.gate_stuck[k]
+            quantum, tells = g.finest[k], (s.valid[l] > 0.0) & (v > 0.0) & (v < np.inf)
+            moved = s.y_hat[l] + s.shift[l] - g.gate_forecast[k]
             tells &= moved * moved > max(MOVED * v, quantum * quantum)
-            chance = chance_of_repeat(s, v, l) if tells else 1.0
+            chance = 1.0  # at most, that a sensor that works repeats its reading
+            if tells:
+                off, share = max(abs(s.e[l]) - 0.5 * quantum, 0.0), g.repeats[k] / (g.repeats[k] + g.steps[k])
+                density = exp(-0.5 * off * off / v) / np.sqrt(2.0 * np.pi * v)
+                chance = min(max(share, quantum * density), 1.0)
             found = prior / (prior + (1.0 - prior) * chance)
-        s.gate_stuck[l] = found
-        s.gate_forecast[l] = s.y_hat[l] + s.shift[l] if s.valid[l] > 0.0 else s.gate_forecast[l]
+        g.gate_stuck[k] = found
+        g.gate_forecast[k] = s.y_hat[l] + s.shift[l] if s.valid[l] > 0.0 else g.gate_forecast[k]
         return found > 0.5
 
     return frozen  # type: ignore[no-any-return]

@@ -263,12 +263,19 @@ class Outputs(KeyedResults, OfRecord):
     @cached_property
     def decided(self) -> Outputs:
         """The run without the codes that its gate found among the first samples; see `Track.decided`."""
-        if self.programs[0].gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
+        if self._start_decided is None:
             return self
-        record, starts = decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)])
+        record, starts, _ = self._start_decided
         tile, each = tile_of(self.programs, starts), np.arange(len(self.outputs))
         lanes = Lanes([(self.programs[0].run(tile, record), tile, each, each)], self._lanes.length)
         return Outputs(self.programs, self.records._replace(y=record.y, u=record.u), lanes, {}, dict(enumerate(starts)))
+
+    @cached_property
+    def _start_decided(self) -> Any:
+        """See `Track`."""
+        if self.programs[0].gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
+            return None
+        return decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)])
 
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
@@ -306,7 +313,8 @@ class Outputs(KeyedResults, OfRecord):
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:
-                left = left_out_of(self.programs[j], lane.written("reason"), y, self.decided.ok[:, j])
+                used, start = self.decided.ok[:, j], self._start_decided[2] if self._start_decided else 0
+                left = left_out_of(self.programs[j], lane.written("reason"), y, used, start).beside(left)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()

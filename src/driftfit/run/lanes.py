@@ -104,14 +104,14 @@ def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
 
 def decided_record(
     programs: Sequence[Program], record: Record, starts: Sequence[State]
-) -> tuple[Record, Sequence[State]]:
+) -> tuple[Record, Sequence[State], int]:
     """(the record without the codes that a gate finds among its first samples, the fields with which its lanes then
-    begin), given the programs of the lanes and the fields with which they began."""
+    begin, the sample at which it finds them), given the programs of the lanes and the fields with which they began."""
     found: list[tuple[int, First]] = []
     tile = tile_of(programs, starts)
     programs[0].drivers().run(tile, *lanes_of(record), programs[0].written(tile, len(record)), found_too=found)
     begun = [{**start, "gate_decided": np.array(1)} for start in starts or [{}] * len(programs)]
-    return without_codes(record, *found[0]), begun
+    return without_codes(record, *found[0]), begun, found[0][0]
 
 
 class Results(NamedTuple):

@@ -259,7 +259,7 @@ class Program:
         """Bring a tile, whose gate has found codes among the first samples, to where it is without them."""
         each = zip(self.trackers, self.model.outputs, strict=False)
         lanes = [replace(self, tracker=tracker, output=name) for tracker, name in each] or [self]
-        first = replayed(tile, self.model.m, ROW if self.rows else "")
+        first = replayed(tile, self.model.m, len(self.rows))
         fresh = tile_of(lanes, [{"gate_decided": np.array(1)}] * len(lanes))
         coded, out = first.codes.any(axis=1), self.written(fresh, len(first.y))
         self.drivers().run(fresh, *first.without_codes(), first.known, out)

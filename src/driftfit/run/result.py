@@ -264,18 +264,26 @@ class Track(Plain, OfRecord):
 
     @cached_property
     def left_out(self) -> LeftOut:
-        """What the gate decided of samples that it did not use as they are; empty without a gate."""
+        """What the gate decided of samples that it did not use as they are, and readings outside their limits."""
         if self.program.gate is None:
             return self._left_out
-        used = self.decided.in_rows("ok") > 0.0
-        return left_out_of(self.program, self.in_rows("reason"), self.record.y, used)
+        used, start = self.decided.in_rows("ok") > 0.0, self._start_decided[2] if self._start_decided else 0
+        found = left_out_of(self.program, self.in_rows("reason"), self.record.y, used, start)
+        return found.beside(self._left_out) if len(self._left_out) else found
+
+    @cached_property
+    def _start_decided(self) -> Any:
+        """What `decided_record` returns; nothing if the gate found no codes among the first samples."""
+        if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
+            return None
+        return decided_record([self.program], self.record, [self.start or {}])
 
     @cached_property
     def decided(self) -> Track:
         """The run without the codes that its gate found among the first samples, for smoothers and judgements."""
-        if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
+        if self._start_decided is None:
             return self
-        record, (start,) = decided_record([self.program], self.record, [self.start or {}])
+        record, (start,), _ = self._start_decided
         return track_record(self.program, record, start=start)
 
     @cached_property

@@ -25,7 +25,6 @@ from driftfit.readings.gate import Gate
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.readings.screen import apart, screen
 from driftfit.run.fleet import Fleet, KeyedResults, Outputs, run_fleet
-from driftfit.run.gating import gate_of
 from driftfit.run.lanes import Lane, Lanes
 from driftfit.run.program import Program, State, programs_of, tile_of
 from driftfit.run.result import Track, track_record
@@ -72,10 +71,12 @@ def track(
     return run  # type: ignore[no-any-return]
 
 
-def in_rows_only(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any = None) -> Result:
-    """`track` of one series for its regressors and readings: nothing is said of estimates that are not looked at."""
-    programs, records, _, _ = _task(model, tracker, y, u, reading, data, None, Kept())
-    return _one(programs, records, "std", None, "float64")
+def run_quietly(
+    model: Model, tracker: Trackers, y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
+) -> Result:
+    """`track` for its regressors, readings or likelihood: nothing is said of estimates that are not looked at."""
+    programs, records, failed, many = _task(model, tracker, y, u, reading, data, by, Kept())
+    return run_fleet(programs, records, "std", failed) if many else _one(programs, records, "std", None, "float64")
 
 
 def parts(
@@ -130,8 +131,8 @@ def _task(
     if kept.prob is not None and (many or len(model.outputs) > 1):
         raise ValueError("track: prob= is for one series and one tracker.")
     if grid and by is None:
-        if gate and not records.outputs:  # one decision for all settings
-            records, gate = decide(model.bind(records.labels.u or records.u.shape[-1]), records, gate)[0], False
+        if gate:  # one decision for all settings
+            records, gate = decide(model, records, gate)[0], False
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = (_per_series(tracker, records) if grid else [tracker] * len(records.keys)) or _any_of(tracker)
     programs, records = _prepared(model, trackers, records, kept.keep, kept.prob, gate)
@@ -340,7 +341,7 @@ Decisions = Mapping[Hashable, LeftOut]
 
 
 def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decisions]:
-    """(the series as every candidate takes them, what was left out of each), given the largest model, bound, and a
+    """(the series as every candidate takes them, what was left out of each), given the largest model and a
     gate (None or False: none), or decisions that were made before; ValueError for a model that the reference does not
     follow.
     """
@@ -353,9 +354,11 @@ def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decision
                 "gate=track(model, tracker, y, u, gate=True).left_out."
             )
         reference = AdaptiveKalman()
-        program = Program(model, reference, gate=gate_of(reference, gate))
-        parts = zip(records.keys, map(records.part, range(len(records.keys))), strict=True)
-        gate = {key: track_record(program, part).left_out for key, part in parts}
+        programs = programs_of(model, reference, records.labels.u or records.u.shape[-1], gate)
+        given = records.in_rows() if model.shared else records
+        runs = (_one(programs, given.some(k, k + 1), "std", None, "float64") for k in range(len(records.keys)))
+        left = (run.left_out if isinstance(run, Track) else {one: run[one].left_out for one in run} for run in runs)
+        gate = dict(zip(records.keys, left, strict=True))
     return decided(model, records, gate)
 
 
@@ -377,4 +380,7 @@ def decided(model: Model, records: Records, gate: Any) -> tuple[Records, Decisio
         for at, one in ((at, gate[own]) for own, at in places.items() if own in gate):
             changed = one.applied(y[at].ravel(), noise[at].ravel())
             y[at], noise[at] = (values.reshape(y[at].shape) for values in changed)
-    return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate
+    listed = {key: one.beside(records.left_out.get(key, NOTHING_LEFT_OUT)) for key, one in gate.items()}
+    return records._replace(
+        y=y, known=records.known.changed(noise=noise), left_out={**records.left_out, **listed}
+    ), gate

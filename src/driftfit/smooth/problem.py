@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.run.columns import COLLECTED, collect, put_fields
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -27,11 +27,12 @@ def collecting_for_smoother(steps: TrackerSteps) -> TrackerSteps:
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """
-    store, note = steps.store_for_smoother, steps.note
+    store, note, notes = steps.store_for_smoother, steps.note, steps.note is not nothing
 
     @kernel
-    def note_all(s: State, l: int) -> None:
-        note(s, l)
+    def note_all(s: State, l: int, g: State, k: int) -> None:
+        if notes:  # a constant
+            note(s, l, g, k)
         s.used_noise[l] = s.noise[l]
 
     @kernel

@@ -38,7 +38,7 @@ from driftfit.judge.constant_fit import constant_outputs, decided_by
 from driftfit.models.base import Model
 from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.live.conformal import quantile
-from driftfit.run.track import decide, records_of, warn_of_codes
+from driftfit.run.track import decide, records_of, run_quietly, warn_of_codes
 from driftfit.show.text import ByOutput
 from driftfit.trackers.base import Tracker
 from driftfit.tune.inference import unknown_at_start
@@ -242,6 +242,17 @@ def tune_outputs(
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
+    reading = reading._replace(gate=tracker.gated if reading.gate is None else reading.gate)
     runs = constant_outputs(model, y, u, reading, data, by)
     tuned = {name: one(Task(some[0].model, *decided_by(some))) for name, some in runs.items()}
-    return tuned["rows"] if model.shared else TunedOutputs(tuned)
+    if model.shared:
+        return tuned["rows"]
+    keys = records_of(model, y, u, reading, data, by)[1].keys
+    gate = {key: {name: some[k].left_out for name, some in runs.items()} for k, key in enumerate(keys)}
+    trackers = {name: found.tracker for name, found in tuned.items()}
+    # lags that were missing are predictions, and those of the run are of the tracker that was found
+    run: Any = run_quietly(model, trackers, y, u, reading._replace(gate=gate), data, by)
+    each = run.values() if by is not None else [run]
+    return TunedOutputs(
+        {name: replace(found, loglik=sum(one[name].loglik for one in each)) for name, found in tuned.items()}
+    )

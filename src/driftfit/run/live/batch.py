@@ -211,9 +211,9 @@ class Batched(Stream):
 
         return noting
 
-    def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0) -> None:
+    def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0, decided: Any = None) -> None:
         """Count a sample that the gate refused."""
-        self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals)
+        self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals, decided)
 
     def _note_start(self, sample: int, time: Any, first: First) -> None:
         """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
@@ -222,7 +222,10 @@ class Batched(Stream):
         times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
         for k, lane in np.argwhere(first.reason).tolist():
             at = None if times is None else times[k]
-            self._note(begun + k // ny, at, first.reason.item(k, lane), first.y.item(k, lane), lane)
+            code, now = first.reason.item(k, lane), sample if time is None else time
+            self._note(
+                begun + k // ny, at, code, first.y.item(k, lane), lane, now if code % SIGNAL == AT_START else None
+            )
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

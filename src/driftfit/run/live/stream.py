@@ -93,12 +93,14 @@ class Tally:
         self.counts: dict[str, int] = dict(counted or {})
         self.last: tuple[Decision, ...] = tuple(Decision(*one) for one in last)
 
-    def add(self, sample: Any, decided: int, value: float, names: Sequence[str]) -> None:
-        """Count a sample that was not used, with the names of the output and the inputs."""
-        signal, code = divmod(int(decided), SIGNAL)
-        name, reason = SAID[code]
+    def add(self, sample: Any, reason: int, value: float, names: Sequence[str], decided: Any = None) -> None:
+        """Count a sample that was not used, with the names of the output and the inputs; it was decided at once, or at
+        a later sample."""
+        signal, code = divmod(int(reason), SIGNAL)
+        name, said = SAID[code]
         self.counts[name] = self.counts.get(name, 0) + 1
-        self.last = (*self.last, Decision(sample, names[signal], value, reason))[-KEPT:]
+        when = sample if decided is None else decided
+        self.last = (*self.last, Decision(sample, names[signal], value, said, when))[-KEPT:]
 
     def __repr__(self) -> str:
         said = ", ".join(f"{name}: {count}" for name, count in self.counts.items())
