@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
+import numpy as np
 from typer import Argument, Option
 
 from driftfit.cli.program import progress, writable
@@ -96,7 +97,7 @@ def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
 
 
-def parse_interval(text: str | None) -> float | str | None:
+def parse_interval(text: str | None, option: str = "--dt") -> float | str | None:
     """``0.5`` as a number; a duration or a step of the calendar as text, in which ``m`` after a number is minutes."""
     if text is None:
         return None
@@ -107,8 +108,19 @@ def parse_interval(text: str | None) -> float | str | None:
     try:
         Clock.of(given)
     except ValueError as error:
-        raise ValueError(f"--dt {text}: {error}") from None
+        raise ValueError(f"{option} {text}: {error}") from None
     return given
+
+
+def parse_seconds(text: str) -> float:
+    """``45``, ``45s`` or ``1m`` in seconds."""
+    given = parse_interval(text, "--budget")
+    if isinstance(given, float):
+        return given
+    length = Clock.of(given).duration
+    if length is None:
+        raise ValueError(f"--budget {text}: give seconds, or a duration such as 45s or 2m.")
+    return float(length / np.timedelta64(1, "s"))
 
 
 Names = list[str] | None

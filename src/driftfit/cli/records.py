@@ -30,10 +30,10 @@ from driftfit.cli.options import (
     limits_from,
     listed,
     parse_interval,
+    parse_seconds,
     reads,
 )
 from driftfit.cli.program import app, draw, progress, say, writable
-from driftfit.cli.tools import compiling_beside
 from driftfit.data.columns import Wanted
 from driftfit.data.limits import end_of
 from driftfit.data.limits import marks as marks_of
@@ -42,7 +42,7 @@ from driftfit.data.tables import read_records
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import marks, missing_settings
-from driftfit.identify.answer import LAST, chosen, identify
+from driftfit.identify.answer import chosen, identify
 from driftfit.identify.page import SERVICE, interval, unit
 from driftfit.identify.roles import NoAnswerError
 from driftfit.judge.structures.select import Selection
@@ -358,10 +358,7 @@ def identify_command(
     gate: Annotated[
         bool | None, Option("--gate/--no-gate", help="Leave out fault codes however many, or use all readings.")
     ] = None,
-    budget: Annotated[
-        float,
-        Option(help="Seconds.", metavar="SECONDS", parser=lambda text: float(str(text).removesuffix("s"))),
-    ] = 45.0,
+    budget: Annotated[str, Option(help="Time for the answer: seconds, or a duration such as 2m.")] = "45s",
     seed: Annotated[int, Option(help="Seed of the displaced copies of inputs.")] = 0,
     page: Annotated[Path | None, Option(help="Write the answer to a page (.html).")] = None,
     json_to: Annotated[Path | None, Option("--json", help="Write the answer as JSON; - is stdout.")] = None,
@@ -382,17 +379,14 @@ def identify_command(
         def tell(text: str) -> None:
             if monotonic() - began > PATIENCE:
                 status.update(text)
-            if text == LAST:
-                compiled()
 
         try:
-            with compiling_beside() as compiled:
-                found = identify(
-                    file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=cells.time,
-                    dt=parse_interval(cells.dt), by=by, limits=ranges, max_lag=max_lag, forecast=forecast,
-                    horizon=horizon, level=level, gate=gate, budget=budget, seed=seed, reading=cells.wanted,
-                    progress=tell,
-                )  # fmt: skip
+            found = identify(
+                file if len(file) > 1 else file[0], y, u=listed(u) or None, not_u=listed(not_u), time=cells.time,
+                dt=parse_interval(cells.dt), by=by, limits=ranges, max_lag=max_lag, forecast=forecast,
+                horizon=horizon, level=level, gate=gate, budget=parse_seconds(budget), seed=seed,
+                reading=cells.wanted, progress=tell,
+            )  # fmt: skip
         except NoAnswerError as error:
             status.stop()
             typer.echo(text := f"driftfit: this record cannot answer: {error}", err=True)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import getpass
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from subprocess import DEVNULL, Popen
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
@@ -26,16 +23,11 @@ from driftfit.cli.options import Own, Setting
 from driftfit.cli.program import app, out, progress, say
 from driftfit.embedded import export_c
 from driftfit.engine.disk_cache import Contents, contents, folder, prune
-from driftfit.judge.changes.null import Lags
-from driftfit.judge.changes.words import events
-from driftfit.judge.evidence import REJECTED, judged_rows
-from driftfit.judge.regressors import Rows
 from driftfit.parsing.settings import default, given_fields, parse_model, parse_tracker
 from driftfit.results import Track
-from driftfit.run.parallel_lanes import FEWEST_LANES, cores
+from driftfit.run.parallel_lanes import FEWEST_LANES
 from driftfit.show.text import facts
 from driftfit.streams import Live
-from driftfit.trackers.forms.diffuse import machine_foresee, machine_learn, machine_root, machine_wander
 from driftfit.tracking import track
 
 
@@ -129,35 +121,6 @@ def warm(
     say(facts(*stored(after, f"{after.files - before.files} new"), ("Seconds", f"{time.perf_counter() - start:.0f}")))
     if folder() is None:
         raise ValueError("no folder can be written, so nothing was kept; set NUMBA_CACHE_DIR.")
-
-
-@contextmanager
-def compiling_beside() -> Iterator[Callable[[], object]]:
-    """While this process works, another compiles what every `driftfit identify` needs, if nothing of it is on disk and
-    there is a core for it: the compiler holds the lock of the interpreter. Yields the function that waits for it.
-    """
-    place = folder()
-    if cores() < 2 or place is None or any(place.glob("draw-*")):
-        yield lambda: None
-        return
-    code = f"from {__name__} import fill; fill()"
-    with Popen([sys.executable, "-c", code], stdout=DEVNULL, stderr=DEVNULL) as beside:
-        try:
-            yield beside.wait
-        finally:
-            beside.terminate()
-
-
-def fill() -> None:
-    """Compile the start of a tracker, and the verdict: of an autoregression whose level jumps."""
-    for one in (machine_learn, machine_foresee, machine_root, machine_wander):
-        one.load()
-    at = np.arange(1, RECORD_LENGTH // 2)
-    y = np.random.default_rng(0).normal(size=RECORD_LENGTH // 2) + 2.0 * (np.arange(RECORD_LENGTH // 2) > at.mean())
-    lags = Lags(np.arange(1), at[:, None] - 2, np.ones((len(at), 1)))
-    rows = Rows(at, np.column_stack([y[:-1], np.ones(len(at))]), y[1:], None, lags, np.ones(len(at)))
-    if found := judged_rows(rows, REJECTED):
-        events(found, ("a1", "intercept"), at, str)
 
 
 def _used(run: Any) -> dict[str, str]:

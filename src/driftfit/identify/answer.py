@@ -26,6 +26,7 @@ from driftfit.identify.structure import Shape, Structure, search
 from driftfit.identify.working_point import cause, products
 from driftfit.judge.changes.words import events
 from driftfit.judge.evidence import REJECTED, Evidence, judged_rows
+from driftfit.judge.on_all_cores import compiling_beside
 from driftfit.judge.verdict import Verdict, judged, p_equals
 from driftfit.models.arx import ARX
 from driftfit.results import Track
@@ -36,8 +37,6 @@ LEFT_OUT = 0.01
 """Share of the readings left out above which there is no answer without ``gate``."""
 RATE, LEAST = 50_000.0, 500
 """Samples times parameters that the tracker and the verdict judge in a second; samples that are judged in any case."""
-LAST = "time or working point"
-"""What is being done once the record is tracked."""
 WORST = 3
 """Records of a fleet that have a page."""
 
@@ -94,20 +93,22 @@ def identify(
     paths = [data] if isinstance(data, str) or hasattr(data, "__fspath__") else data if isinstance(data, list) else []
     source = tuple(map(str, paths)) or ("data.csv",)
     found = replace(found, options=found.options + ("" if gate is None else " --gate" if gate else " --no-gate"))
-    task = _Task(end, int(forecast), horizon, level, gate, seed, progress, source)
-    structure = task.structure(found, max_lag)
-    model = model_of(found, structure.shape)
-    found, structure = task.affordable(found, structure, model.n)
-    if found.by is None:
-        return task.judged(found, structure)
-    progress("tracking")
-    fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
-    verdicts, worst, by = fleet.verdict(level), {}, "" if found.by == BACK else f" --by {shlex.quote(found.by)}"
-    for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
-        at = np.flatnonzero([one == key for one in found.key])
-        own = replace(found.rows(at), by=None, options=found.options + by)
-        worst[key] = task.judged(own, structure)
-    return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure), source)
+    with compiling_beside() as compiled:
+        task = _Task(end, int(forecast), horizon, level, gate, seed, progress, compiled, source)
+        structure = task.structure(found, max_lag)
+        model = model_of(found, structure.shape)
+        found, structure = task.affordable(found, structure, model.n)
+        if found.by is None:
+            return task.judged(found, structure)
+        progress("tracking")
+        fleet = track(model, AdaptiveKalman(), **found.signals(model.input_names), by=found.by, gate=gate)
+        compiled()
+        verdicts, worst, by = fleet.verdict(level), {}, "" if found.by == BACK else f" --by {shlex.quote(found.by)}"
+        for key in (row.key for row in verdicts.rows[:WORST] if row.drifts is not None):
+            at = np.flatnonzero([one == key for one in found.key])
+            own = replace(found.rows(at), by=None, options=found.options + by)
+            worst[key] = task.judged(own, structure)
+        return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure), source)
 
 
 def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
@@ -133,6 +134,7 @@ class _Task:
     gate: bool | None = None
     seed: int = 0
     progress: Callable[[str], None] = lambda text: None
+    compiled: Callable[[], object] = lambda: None
     source: tuple[str, ...] = ("data.csv",)
 
     def structure(self, found: Roles, max_lag: int, forecast: bool = True) -> Structure:
@@ -163,10 +165,12 @@ class _Task:
         self.progress("tracking")
         run: Track = track(model, AdaptiveKalman(), **found.signals(model.input_names), gate=self.gate)
         known = Evidence(run, level=self.level)
-        self.progress(LAST)
+        self.progress("time or working point")
         y, U, place = replace(found, y=run.used_record.y).spread(structure.na + 40)
         rows, (Z, made) = known.rows, products(y, U, structure, found.inputs, found.output, self.first)
         why_not = cause(rows.phi, rows.y, Z[place][rows.at] * np.reshape(np.asarray(rows.root), (-1, 1)), made)
+        errors, (memory, own) = errors_of(known, self.horizon), effects(known)
+        self.compiled()
         verdict = judged(known)
         besides, again = bool(verdict.drifts), None
         if besides and why_not.products:
@@ -178,7 +182,6 @@ class _Task:
             judged_rows(with_lags(rows, y, U, place, shape), self.level) for shape, *_ in structure.second if besides
         )
         least = next((one.test.p for one in others if one is not None and not one.rejected), 0.0)
-        memory, own = effects(known)
         other = f"with the chosen structure ({p_equals(verdict.p)}), but not with one of the next ({p_equals(least)})"
         why = f"constants are rejected {other}" if least else verdict.untested
         share = 100.0 * max(len(run.left_out), *found.refused.values(), 0) / len(run)
@@ -193,7 +196,7 @@ class _Task:
             happened = events(again, [*model.names, *curve], told.at, run.time_text)
         moved = moves(happened, run, told, curve, memory.root)
         return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory,
-                              errors_of(known, self.horizon), _notes(found, run, y, U, structure),
+                              errors, _notes(found, run, y, U, structure),
                               _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.structure import Pool, Shape
 from driftfit.judge.changes.null import Lags
 from driftfit.judge.changes.words import Event
-from driftfit.judge.compare import persistence
+from driftfit.judge.compare import LAGS, constant_arx, persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.paired import LEAST
@@ -110,14 +110,20 @@ def mixed(y: Array, errors: Array, h: int) -> Array:
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
-    run, own, steady, found = known.run, known.errors, known.steady, []
-    y, phi = run.used_record.y, np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
-    paths = (moved(path, 1) for path in (run.theta, steady["theta"][..., 0]))
-    far = [y - steps_ahead(path, phi, run.model.output_lags or 0, horizon) for path in paths]
+    run, own, found = known.run, known.errors, []
+    y, arx = run.used_record.y, constant_arx(run.used_record)
+
+    def far(theta: Array, fitted: Array, lags: int) -> Array:
+        phi = np.where(fitted["valid"] > 0.0, fitted["phi"][..., 0], np.nan)
+        return y - steps_ahead(moved(theta, 1), phi, lags, horizon)
+
     rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
     cases = [(1, [own.tracked, own.constant_ls], rivals)]
     if horizon > 1:
-        cases.append((horizon, far, {"persistence": y - moved(persistence(y), horizon - 1)}))
+        both = [far(theta, known.steady, run.model.output_lags or 0)
+                for theta in (run.theta, known.steady["theta"][..., 0])]  # fmt: skip
+        rivals = {"constant ARX": far(arx["theta"][..., 0], arx, LAGS)}
+        cases.append((horizon, both, rivals | {"persistence": y - moved(persistence(y), horizon - 1)}))
     for h, both, others in cases:
         errors = {"driftfit": mixed(y, np.stack(both), h), "tracked": both[0], "constants": both[1], **others}
         at = own.scored & np.isfinite([*errors.values()]).all(axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ from driftfit.identify.working_point import Cause
 from driftfit.judge.fleet_verdict import ManyVerdicts
 from driftfit.judge.verdict import Verdict, p_equals
 from driftfit.models.arx import ARX, arx_text
-from driftfit.models.hammerstein_wiener.basis import Polynomial
+from driftfit.models.hammerstein_wiener.basis import Legendre
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.results import Track
 from driftfit.run.result import root_mean_square
@@ -226,11 +227,19 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     said = [f"{head}: {'; '.join(each)}." for head, each in
             (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
-    short = [line if len(line) < WIDTH else f"{line[:at]} \\\n  {line[at:]}" for line in commands(answer)
-             for at in [max(line.find(" --model"), line.find(" --quiet"))]]  # fmt: skip
-    return [
-        (style, f" {line}") for style, line in (*found, *(("", one) for one in said), *(("dim", one) for one in short))
-    ]
+    copied = [part for line in commands(answer) for part in joined(line)]
+    return [(style, f" {line}") for style, line in
+            (*found, *(("", one) for one in said), *(("dim", one) for one in copied))]  # fmt: skip
+
+
+def joined(command: str) -> list[str]:
+    """A command in lines that a shell joins, and that are not wrapped once more."""
+    found = [""]
+    for part in re.split(r"(?= --| &&)", command):
+        if found[-1] and len(found[-1]) + len(part) > WIDTH - 4:
+            found[-1:] = [f"{found[-1]} \\", " "]
+        found[-1] += part
+    return found
 
 
 def finite(value: Any) -> Any:
@@ -398,7 +407,9 @@ class Identification(Printed):
     def curve(self) -> Track:
         """A Hammerstein-Wiener model with constants and a curve of each input that bends, of all if the output does."""
         model, bent = self.model, "".join(self.cause.of)
-        bases = [Polynomial(3) if f"[{name}]" in bent or "[" not in bent else None for name in model.input_names]
+        ends = {name: (float(f"{np.nanmin(x):.3g}"), float(f"{np.nanmax(x):.3g}"))
+                for name, x in zip(model.input_names, self.track.u.T, strict=True)}  # fmt: skip
+        bases = [Legendre(3, ends[name]) if f"[{name}]" in bent or "[" not in bent else None for name in ends]
         nb, nk = zip(*model.lags, strict=True)
         curved = HammersteinWiener(model.na, nb, nk, input=bases, inputs=model.input_names, intercept=True)
         fitted: Track = track(curved, RLS(1.0), **self.roles.signals(model.input_names))
@@ -419,7 +430,7 @@ class Identification(Printed):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for style, line in lines(self):
-            yield Text(line, style)
+            yield Text(line, style, no_wrap=style == "dim", overflow="ignore")
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,20 @@ def _constant_arx(inputs: int) -> ARX:
     return ARX(2, 1 if inputs else 0, inputs=inputs, intercept=True)
 
 
+def constant_arx(record: Record) -> Array:
+    """Constants of ARX(2, 1 per input) with intercept over a record: (T,) records as of `constant_least_squares`."""
+    y = _usable(record.y)
+    gaps, unused = record.known.interval, np.broadcast_to(record.known.noise == np.inf, len(y)).copy()
+    unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
+    gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
+    known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
+    return constant_least_squares(_constant_arx(record.u.shape[1]), Record(y, record.u, known))
+
+
+def _usable(y: Array) -> Array:
+    return np.where(np.abs(y) < LARGEST, y, np.nan)
+
+
 def errors(run: Track, record: Record, burn: int | None = None, steady: Array | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
@@ -88,13 +102,8 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     default those of `left_at_start`. ``record`` is what they learn from (`Track.used_record`); ``steady`` are the
     constants of the run, if they are known.
     """
-    y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
+    y, u, arx = _usable(record.y), record.u, constant_arx(record)
     steady = constant_least_squares(run.model, record) if steady is None else steady
-    gaps, unused = record.known.interval, np.broadcast_to(record.known.noise == np.inf, len(y)).copy()
-    unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
-    gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
-    known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
-    arx = constant_least_squares(_constant_arx(u.shape[1]), Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     lagged = _with_lags(run.model, steady, y, constant, record.known)
     lagged = np.where(np.isfinite(lagged), lagged, constant)

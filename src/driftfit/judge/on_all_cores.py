@@ -8,6 +8,9 @@ Each process is a new interpreter that imports the package and reads batches fro
 the workers of ``multiprocessing``, it does not run the user's script again, so scripts need no guard against that. A
 batch that fails there is judged in a thread of this process instead: a model that the user's script defines cannot be
 sent, and a process may be killed for its memory. An error is then raised here, where the user can read it.
+
+The compiler holds the lock of the interpreter, so a second process also compiles while the first one works, into the
+folder that both read (`compiling_beside`).
 """
 
 from __future__ import annotations
@@ -16,19 +19,33 @@ import gc
 import os
 import pickle
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
+from subprocess import DEVNULL, PIPE, Popen
 from time import monotonic
 from typing import IO, Any, Self, TypeVar
 
+import numpy as np
+
 from driftfit.engine.compile_notice import PATIENCE
+from driftfit.engine.disk_cache import folder
+from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.outlined import outlined
+from driftfit.engine.phases import looking
+from driftfit.engine.tiles import as_compiled, tile_type
+from driftfit.engine.tracker_part import tracker_part
+from driftfit.judge.changes.null import Lags
+from driftfit.judge.changes.words import events
+from driftfit.judge.evidence import REJECTED, judged_rows
+from driftfit.judge.regressors import Rows
+from driftfit.models.arx import ARX
 from driftfit.run.parallel_lanes import cores
-from driftfit.run.program import progress_bar
+from driftfit.run.program import Program, progress_bar
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 
 Result = TypeVar("Result")
 FIRST = 5
@@ -41,7 +58,9 @@ BATCH = 0.2
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """A process has one core: threads of its linear algebra would wait for one another, and take twice the time."""
 
-SERVE = "from driftfit.judge.on_all_cores import serve; serve()"
+MODULE = "driftfit.judge.on_all_cores"
+SAMPLES = 300
+"""Of the record that is judged so that the verdict is compiled."""
 
 
 def on_all_cores(
@@ -94,20 +113,18 @@ def available() -> bool:
     return Path(sys.executable or "").stem.lower().startswith(("python", "pypy"))
 
 
+def _python(function: str, **streams: int) -> Popen[bytes]:
+    """A new interpreter that runs a function of this module."""
+    code = f"from {MODULE} import {function}; {function}()"
+    path = os.pathsep.join(filter(None, sys.path))
+    return Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path} | ONE_THREAD, **streams)
+
+
 class Processes:
     """A number of processes, as a context: they end with it."""
 
     def __init__(self, count: int) -> None:
-        path = os.pathsep.join(filter(None, sys.path))
-        self._all: list[Any] = [
-            subprocess.Popen(
-                [sys.executable, "-c", SERVE],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=os.environ | {"PYTHONPATH": path} | ONE_THREAD,
-            )
-            for _ in range(count)
-        ]
+        self._all: list[Any] = [_python("serve", stdin=PIPE, stdout=PIPE) for _ in range(count)]
         self._idle: SimpleQueue[Any] = SimpleQueue()
         for process in self._all:
             self._idle.put(process)
@@ -160,3 +177,39 @@ def _send(stream: IO[bytes], what: Any) -> None:
     """A pickle within a pickle: what cannot be read from it leaves the stream where the next one begins."""
     pickle.dump(pickle.dumps(what, pickle.HIGHEST_PROTOCOL), stream, pickle.HIGHEST_PROTOCOL)
     stream.flush()
+
+
+@contextmanager
+def compiling_beside() -> Iterator[Callable[[], object]]:
+    """While this process works, another compiles half of what every `driftfit.identify` needs, if nothing of it is on
+    disk and there is a core for it. Yields the function that waits for it.
+    """
+    place = folder()
+    if cores() < 2 or not available() or place is None or any(place.glob("draw-*")):
+        yield lambda: None
+        return
+    with _python("fill", stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL) as beside:
+        try:
+            yield beside.wait
+        finally:
+            beside.terminate()
+
+
+def fill() -> None:
+    """Compile a step of the default tracker, which is the same for all models, and the verdict: of an autoregression
+    whose level jumps.
+    """
+    program = Program(ARX(1, 0, intercept=True), AdaptiveKalman())
+    look = outlined(looking(program.steps))
+
+    @Driver
+    def only(tile: Array) -> None:
+        look(tracker_part(tile[0]))
+
+    only.entry(tile_type(as_compiled(program.tile())))
+    at = np.arange(1, SAMPLES)
+    y = np.random.default_rng(0).normal(size=SAMPLES) + 2.0 * (np.arange(SAMPLES) > at.mean())
+    lags = Lags(np.arange(1), at[:, None] - 2, np.ones((len(at), 1)))
+    rows = Rows(at, np.column_stack([y[:-1], np.ones(len(at))]), y[1:], None, lags, np.ones(len(at)))
+    if found := judged_rows(rows, REJECTED):
+        events(found, ("a1", "intercept"), at, str)
