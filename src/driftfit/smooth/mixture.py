@@ -164,7 +164,7 @@ class Mixture(NamedTuple):
         more = self.kept.copy()
         for t in np.flatnonzero(self.uneven):
             near = slice(max(t - NEAR, 0), t + NEAR)
-            more[near] = np.minimum(4 * self.kept[near], MOST_COMPONENTS)
+            more[near] = MOST_COMPONENTS
         return more
 
 

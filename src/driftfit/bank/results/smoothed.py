@@ -131,7 +131,7 @@ def problem_of(run: Track, faults: list[Event], kinds: Array | None = None) -> P
     start = np.zeros((0, n + 1))
     if bank.p0 is not None:
         axes, rows = np.linalg.eigh(matrix("Bank", "p0", bank.p0, n) * relative)
-        rows = rows.T / np.sqrt(np.maximum(axes, KNOWN * axes.max()))[:, None]
+        rows = rows.T / np.sqrt(np.maximum(axes, np.finfo(float).eps * axes.max()))[:, None]
         start = np.column_stack([rows, rows @ np.broadcast_to(bank.theta0, n)])
     priors = Priors(bank, run, replayed["dt"][:, 0], kinds)
     roots = np.array([triangular_root(Q) for Q in moves])
@@ -140,10 +140,6 @@ def problem_of(run: Track, faults: list[Event], kinds: Array | None = None) -> P
         phi, replayed["y"][:, 0].copy(), np.where(sound, noise * weighs, np.inf), Alternatives(*priors.moves(), roots),
         priors.table, priors.sizes(), start, priors.noises(),
     )  # fmt: skip
-
-
-KNOWN = 1e-16
-"""Smallest variance of a prior, as a share of the largest."""
 
 
 class Priors:
