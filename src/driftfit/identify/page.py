@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -61,7 +60,6 @@ SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": l
 """JSON Schema of `ManyIdentified.json`."""
 SERVICE = '[source.web]\nkind = "http"\n\n'
 """What a configuration of a service needs beside a unit: samples come by HTTP."""
-WEEKLY = '{ every = "1 week" }'
 CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
 its 95 % band, from the past only. Red: when it changed."""
 
@@ -180,17 +178,16 @@ def commands(answer: Identification) -> list[str]:
     each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
     given = {name: f"--{name} {shlex.quote(value)}" for name, value in each.items() if value}
-    files, options, toml = shlex.join(answer.source), roles.options, shlex.quote(f"{stem(answer.source)}.toml")
+    files, options, toml = (
+        shlex.join(answer.source),
+        roles.options,
+        shlex.quote(f"{PurePath(answer.source[0]).stem}.toml"),
+    )
     found = " ".join(text for name, text in given.items() if name != "model")
     return [
         *(f"driftfit {verb} {files} {' '.join(given.values())}{options}" for verb in ("track", "detect")),
         f"driftfit identify {files} {found}{options} --quiet --serve {toml} && driftfit serve {toml}",
     ]
-
-
-def stem(source: Sequence[str]) -> str:
-    """The name of the first file, without its folder and ending."""
-    return PurePath(source[0]).stem
 
 
 def interval(roles: Roles) -> str:
@@ -200,13 +197,14 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification | ManyIdentified) -> str:
     """The unit of a service, as TOML; of records a pattern, which makes one of every topic."""
-    roles, match = answer.roles, stem(answer.source) if isinstance(answer, Identification) else "{unit}"
+    roles, match = answer.roles, PurePath(answer.source[0]).stem if isinstance(answer, Identification) else "{unit}"
     own = dict[str, Any](match=match, y=roles.output, u=answer.model.input_names)
     timed = roles.clock is not None and isinstance(roles.dt, str) and Clock.of(roles.dt).duration is not None
     own |= {"time": roles.clock, "dt": roles.dt} if timed else {}
     own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
-    return f"[[unit]]\n{text}alarm = {WEEKLY if timed else '{}'}\n"
+    every = ' every = "1 week" ' if timed else ""
+    return f"[[unit]]\n{text}alarm = {{{every}}}\n"
 
 
 def effect(answer: Identification, one: Effect) -> str:
@@ -227,19 +225,8 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     said = [f"{head}: {'; '.join(each)}." for head, each in
             (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
-    copied = [part for line in commands(answer) for part in joined(line)]
-    return [(style, f" {line}") for style, line in
-            (*found, *(("", one) for one in said), *(("dim", one) for one in copied))]  # fmt: skip
-
-
-def joined(command: str) -> list[str]:
-    """A command in lines that a shell joins, and that are not wrapped once more."""
-    found = [""]
-    for part in re.split(r"(?= --| &&)", command):
-        if found[-1] and len(found[-1]) + len(part) > WIDTH - 4:
-            found[-1:] = [f"{found[-1]} \\", " "]
-        found[-1] += part
-    return found
+    copied = [("dim", one) for one in commands(answer)]
+    return [(style, f" {line}") for style, line in (*found, *(("", one) for one in said), *copied)]
 
 
 def finite(value: Any) -> Any:

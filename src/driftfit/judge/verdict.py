@@ -377,7 +377,7 @@ def judged(known: Evidence) -> Verdict:
     own = {name: _moved(found, happened, name, i) for i, name in enumerate(names)} if found is not None else {}
     scored = known.errors.scored
     y = run.y[scored]
-    error, *others = (rounded(each[scored], y) for each in known.errors[:-1])
+    error, *others = (rounded(each[scored], y) for each in known.errors[:-2])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
     loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.noise.ranks)
