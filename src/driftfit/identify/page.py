@@ -19,7 +19,7 @@ from rich.text import Text
 
 from driftfit.data.clock import Clock
 from driftfit.fleets import Fleet
-from driftfit.identify.judgement import Effect, Errors, Memory, Move
+from driftfit.identify.judgement import Effect, Errors, Memory, Move, parts
 from driftfit.identify.roles import Roles
 from driftfit.identify.structure import TIED, Shape, Structure
 from driftfit.identify.working_point import Cause
@@ -37,6 +37,7 @@ from driftfit.show.text import WIDTH, Printed
 from driftfit.streams import Live
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
+from driftfit.use.system import Response, spread, taken
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,8 +61,8 @@ SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": l
 """JSON Schema of `ManyIdentified.json`."""
 SERVICE = '[source.web]\nkind = "http"\n\n'
 """What a configuration of a service needs beside a unit: samples come by HTTP."""
-CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
-its 95 % band, from the past only. Red: when it changed."""
+CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the {} of each input with its 95 %
+band, from the past only. Red: when it changed, of a gradual change the beginning and the end."""
 
 
 def number(value: float) -> str:
@@ -108,8 +109,9 @@ def others(answer: Identification) -> list[str]:
 
 def curve(answer: Identification) -> str:
     """What the curve is made of."""
+    first, rest = ", ".join(answer.cause.products[:3]), len(answer.cause.products) - 3
     nats = f"{answer.cause.curve[0]:.0f} nats over a straight line"
-    return f"the effects depend on the working point ({', '.join(answer.cause.products)}; {nats})"
+    return f"the effects depend on the working point ({first}{f' and {rest} more' if rest > 0 else ''}; {nats})"
 
 
 def sentences(answer: Identification) -> list[str]:
@@ -257,20 +259,23 @@ def as_json(answer: Identification) -> dict[str, Any]:
 
 
 def figure(answer: Identification) -> Figure:
-    """The picture of the page: the output with its prediction, and the static gain of the first four inputs."""
+    """The picture of the page: the output with its prediction, and the effects of the first four inputs."""
     run, shown = answer.track, answer.model.input_names[:4]
     drawn, axes = panels(None, (9.5, 2.4 + 1.6 * max(len(shown), 1)), 1 + len(shown), sharex=True)
     draw_prediction(axes[0], run)
     at = np.arange(settled(run).start, len(run), -(-len(run) // 200))
-    gains = zip(axes[1:], shown, *(x.T for x in run.dc_gain(at).band()), strict=False) if shown else ()
-    for axis, name, *band in gains:
+    own = np.reshape([x for what, x in parts(run).items() if what in shown], (-1, run.model.n)).T
+    sums = Response(*spread(lambda theta: theta @ own, *taken(run, at)))
+    gains = sums if answer.memory.root or not shown else run.dc_gain(at)
+    for axis, name, *band in zip(axes[1:], shown, *(x.T for x in gains.band()), strict=False):
         axis.fill_between(run.time[at], *band, color=BLUE, alpha=0.2, lw=0)
         axis.plot(run.time[at], np.mean(band, axis=0), color=BLUE, lw=1.3)
         axis.set_ylabel(f"effect of\n{name}")
         axis.grid(alpha=0.25, lw=0.5)
         frame(axis, np.clip(band, *np.nanpercentile(band, (2.0, 98.0))))
         for move in (one for one in answer.moves if one.what == name and one.kind != "wandering"):
-            axis.axvline(run.time[move.at], color=RED, lw=1.0)
+            for t in (move.at, move.end) if move.kind == "gradual" else (move.at,):
+                axis.axvline(run.time[t], color=RED, lw=1.0)
     axes[-1].set_xlabel(time_label(run))
     for axis in axes:
         date_axis(axis, run)
@@ -306,7 +311,7 @@ def body(answer: Identification) -> list[str]:
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
         section("What, since when, how large", _listed([*sentences(answer), *each])),
-        section("The picture", picture(figure(answer), answer.track, CAPTION)),
+        section("The picture", picture(figure(answer), answer.track, CAPTION.format(answer.effect))),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
         section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer.roles)])),
@@ -394,7 +399,7 @@ class Identification(Printed):
     def curve(self) -> Track:
         """A Hammerstein-Wiener model with constants and a curve of each input that bends, of all if the output does."""
         model, bent = self.model, "".join(self.cause.of)
-        ends = {name: (float(f"{np.nanmin(x):.3g}"), float(f"{np.nanmax(x):.3g}"))
+        ends = {name: (float(np.nanmin(x)), float(np.nanmax(x)))
                 for name, x in zip(model.input_names, self.track.u.T, strict=True)}  # fmt: skip
         bases = [Legendre(3, ends[name]) if f"[{name}]" in bent or "[" not in bent else None for name in ends]
         nb, nk = zip(*model.lags, strict=True)
