@@ -369,7 +369,8 @@ def identify_command(
 
     Exit codes: 0 answered, 1 undecided, 2 arguments or file, 3 the record cannot answer.
     """
-    writable(page, "--page")
+    for path, option in ((page, "--page"), (json_to, "--json"), (serve, "--serve")):
+        writable(path, option)
     ranges = dict(limits_from(one, [one.rpartition("=")[0].strip()]) for one in cells.limits or [])
     began = monotonic()
     with progress.status("reading") as status:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import tempfile
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -233,7 +232,7 @@ def serve(
     if check:
         say(service.described(config), soft_wrap=True)
         return
-    with tempfile.TemporaryDirectory(prefix="driftfit-demo-") as temporary:
+    with TemporaryDirectory(prefix="driftfit-demo-") as temporary:
         home = Path(temporary) if demo and folder is None else home
         progress.print(service.greeting(config, home), markup=False, highlight=False, soft_wrap=True)
         if rebuild:

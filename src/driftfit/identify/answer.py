@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.columns import Wanted
-from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
+from driftfit.engine.settings import numbers, whole
 from driftfit.identify.judgement import effects, errors_of, feedback, moves, with_lags
 from driftfit.identify.page import KINDS, Identification, ManyIdentified
 from driftfit.identify.roles import BACK, Roles, roles
@@ -83,7 +82,7 @@ def identify(
     driftfit.identify.roles.NoAnswerError
         For a record that cannot answer: fewer than 60 rows with all lags, a constant output, text.
     """
-    end = monotonic() + budget
+    end = monotonic() + numbers("identify", "budget", budget, low=0.0)
     max_lag, horizon = whole("identify", "max_lag", max_lag, 1), whole("identify", "horizon", horizon, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"identify: level must be between 0 and 1, such as 0.05; got {level!r}.")
@@ -108,7 +107,7 @@ def identify(
             at = np.flatnonzero([one == key for one in found.key])
             own = replace(found.rows(at), by=None, options=found.options + by)
             worst[key] = task.judged(own, structure)
-        return ManyIdentified(model, fleet, verdicts, worst, found, _of_data(found, structure), source)
+        return ManyIdentified(model, fleet, verdicts, worst, found, _notes(found, structure), source)
 
 
 def chosen(data: Any, y: str, time: str | None, reading: Wanted) -> tuple[Roles, ARX]:
@@ -153,11 +152,9 @@ class _Task:
         """As many of the last samples of every record as can be judged in what is left of the budget, and the note."""
         sizes = [len(part) for part in found.parts]
         most = max(LEAST, int(RATE * (self.end - monotonic()) / n / len(sizes)))
-        if most >= max(sizes):
-            return found, structure
         of = str(sizes[0]) if found.by is None else "every record"
-        short = f"only the last {most} samples of {of} were judged (--budget)"
-        return found.last(most), replace(structure, narrowed=(*structure.narrowed, short))
+        note = [f"only the last {most} samples of {of} were judged (--budget)"] if most < max(sizes) else []
+        return found.last(most) if note else found, replace(structure, narrowed=(*structure.narrowed, *note))
 
     def judged(self, found: Roles, structure: Structure) -> Identification:
         """The answer for one record."""
@@ -189,37 +186,33 @@ class _Task:
             why = f"{share:.1f} % of the readings look like fault codes or spikes and were left out; "
             why += "if they are, say so with --gate, and if not, with --no-gate"
         moving = {"working point": 1, "both": 2}.get(why_not.kind(besides), 0)
+        if found.dropped > LEFT_OUT * (len(run) + found.dropped):
+            why = f"{found.dropped} rows without a time of their own were left out; see --by and --time"
         kind = KINDS[4 if why else moving if verdict.drifts or moving == 1 else 3]
         happened, told, curve = verdict.events if kind in ("moves", "both") else (), rows, why_not.of[:0]
         if kind == "both" and again is not None:
             told, curve = curved, why_not.of
             happened = events(again, [*model.names, *curve], told.at, run.time_text)
         moved = moves(happened, run, told, curve, memory.root)
-        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory,
-                              errors, _notes(found, run, y, U, structure),
-                              _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
+        fed = [j for j in structure.lags if feedback(y, U[:, j])]
+        notes = _notes(found, structure, len(y) - len(found.y), run.left_out.counts, fed)
+        return Identification(kind, why, model, run, verdict, found, structure, why_not, own, moved, memory, errors,
+                              notes, _undecided(structure, found.inputs, verdict), self.source)  # fmt: skip
 
 
-def _notes(found: Roles, run: Track, y: Array, U: Array, structure: Structure) -> tuple[str, ...]:
-    """Problems of the data, each in a few words."""
-    fed = [j for j in structure.lags if feedback(y, U[:, j])]
+def _notes(found: Roles, structure: Structure, gaps: int = 0, counts: Mapping[str, int] | None = None,
+           fed: Sequence[int] = ()) -> tuple[str, ...]:  # fmt: skip
+    """Problems of the data: ``counts`` are readings that the gate left out, ``fed`` inputs on which the output acts."""
     at_once = {j: ", so what it explains at once may be its response" for j in fed if structure.lags[j][1] == 0}
-    return (
-        *_of_data(found, structure),
-        *(f"{count} {reason}, left out by the gate" for reason, count in run.left_out.counts.items()),
-        *([f"gaps in time of {len(y) - len(found.y)} samples in all"] if len(y) > len(found.y) else []),
-        *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
-    )
-
-
-def _of_data(found: Roles, structure: Structure) -> tuple[str, ...]:
-    """Those of all records."""
     return (
         *([] if found.inputs else [f"no input moves, so only its own past can explain {found.output}"]),
         *(f"{name}: {count} left out as codes or spikes" for name, count in found.refused.items()),
         *([f"missing readings: {found.missing}"] if found.missing else []),
         *([f"rows without a time of their own, left out: {found.dropped}"] if found.dropped else []),
         *structure.narrowed,
+        *(f"{count} {reason}, left out by the gate" for reason, count in (counts or {}).items()),
+        *([f"gaps in time of {gaps} samples in all"] if gaps else []),
+        *(f"{found.output} acts on {found.inputs[j]} (feedback){at_once.get(j, '')}" for j in fed),
     )
 
 

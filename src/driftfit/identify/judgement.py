@@ -25,7 +25,7 @@ from driftfit.identify.roles import NoAnswerError
 from driftfit.identify.structure import Pool, Shape
 from driftfit.judge.changes.null import Lags
 from driftfit.judge.changes.words import Event
-from driftfit.judge.compare import LAGS, constant_arx, persistence
+from driftfit.judge.compare import persistence
 from driftfit.judge.evidence import Evidence
 from driftfit.judge.regressors import Rows
 from driftfit.judge.statistics.paired import LEAST
@@ -89,13 +89,17 @@ class Move(NamedTuple):
     bent: bool = False
 
 
-def mixed(y: Array, errors: Array, h: int) -> Array:
-    """Errors (T,) of the mixture of two predictions h steps ahead of y (T,), from their errors (2, T)."""
+def bounded(y: Array, errors: Array, h: int) -> Array:
+    """Errors (.., T) of predictions that stay within the outputs up to h steps ago, widened by their range."""
     past = moved(y, h)
     low, high = np.fmin.accumulate(past), np.fmax.accumulate(past)
-    e = y - np.clip(y - errors, 2.0 * low - high, 2.0 * high - low)
-    known = np.isfinite(e).all(axis=0)
-    squares = np.where(known, e**2, 0.0)
+    return np.asarray(y - np.clip(y - errors, 2.0 * low - high, 2.0 * high - low))
+
+
+def mixed(errors: Array, h: int) -> Array:
+    """Errors (T,) of the mixture of two `bounded` predictions h steps ahead, from their errors (2, T)."""
+    known = np.isfinite(errors).all(axis=0).astype(float)
+    squares = np.where(known > 0.0, errors**2, 0.0)
     before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
     v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
     with np.errstate(over="ignore"):
@@ -104,28 +108,26 @@ def mixed(y: Array, errors: Array, h: int) -> Array:
     for ratio in worse.tolist():
         w = weights[-1]
         weights.append(SHARE + (1.0 - 2.0 * SHARE) / (1.0 + (1.0 - w) / w * ratio))
-    share = np.array(weights[: len(y)])
-    return np.asarray(share * e[0] + (1.0 - share) * e[1])
+    share = np.array(weights[: errors.shape[1]])
+    return np.asarray(share * errors[0] + (1.0 - share) * errors[1])
 
 
 def errors_of(known: Evidence, horizon: int) -> tuple[Errors, ...]:
     """Errors one step and ``horizon`` steps ahead of a run and of simpler predictions."""
-    run, own, found = known.run, known.errors, []
-    y, arx = run.used_record.y, constant_arx(run.used_record)
-
-    def far(theta: Array, fitted: Array, lags: int) -> Array:
-        phi = np.where(fitted["valid"] > 0.0, fitted["phi"][..., 0], np.nan)
-        return y - steps_ahead(moved(theta, 1), phi, lags, horizon)
-
-    rivals = {"constant ARX": own.constant_arx, "persistence": own.persistence}
-    cases = [(1, [own.tracked, own.constant_ls], rivals)]
-    if horizon > 1:
-        both = [far(theta, known.steady, run.model.output_lags or 0)
-                for theta in (run.theta, known.steady["theta"][..., 0])]  # fmt: skip
-        rivals = {"constant ARX": far(arx["theta"][..., 0], arx, LAGS)}
-        cases.append((horizon, both, rivals | {"persistence": y - moved(persistence(y), horizon - 1)}))
-    for h, both, others in cases:
-        errors = {"driftfit": mixed(y, np.stack(both), h), "tracked": both[0], "constants": both[1], **others}
+    run, own, steady, found = known.run, known.errors, known.steady, []
+    y, na = run.used_record.y, run.model.output_lags or 0
+    fits = {
+        "tracked": (own.tracked, run.theta, steady, na),
+        "constants": (own.constant_ls, steady["theta"][..., 0], steady, na),
+        "constant ARX": (own.constant_arx, own.arx["theta"][..., 0], own.arx, 2),
+    }
+    for h in dict.fromkeys((1, horizon)):
+        errors = {}
+        for name, (e, theta, fit, lags) in fits.items():
+            phi = np.where(fit["valid"] > 0.0, fit["phi"][..., 0], np.nan)
+            errors[name] = bounded(y, e if h == 1 else y - steps_ahead(moved(theta, 1), phi, lags, h), h)
+        errors["persistence"] = y - moved(persistence(y), h - 1)
+        errors = {"driftfit": mixed(np.stack([errors["tracked"], errors["constants"]]), h), **errors}
         at = own.scored & np.isfinite([*errors.values()]).all(axis=0)
         found.append(Errors(h, {name: root_mean_square(e[at]) for name, e in errors.items()}, int(at.sum())))
     return tuple(found)

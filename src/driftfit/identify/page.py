@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
@@ -20,7 +19,7 @@ from rich.text import Text
 
 from driftfit.data.clock import Clock
 from driftfit.fleets import Fleet
-from driftfit.identify.judgement import Effect, Errors, Memory, Move
+from driftfit.identify.judgement import Effect, Errors, Memory, Move, parts
 from driftfit.identify.roles import Roles
 from driftfit.identify.structure import TIED, Shape, Structure
 from driftfit.identify.working_point import Cause
@@ -38,6 +37,7 @@ from driftfit.show.text import WIDTH, Printed
 from driftfit.streams import Live
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
+from driftfit.use.system import Response, spread, taken
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,9 +61,8 @@ SCHEMA_OF_RECORDS = {"title": f"{NAME}/records", "type": "object", "required": l
 """JSON Schema of `ManyIdentified.json`."""
 SERVICE = '[source.web]\nkind = "http"\n\n'
 """What a configuration of a service needs beside a unit: samples come by HTTP."""
-WEEKLY = '{ every = "1 week" }'
-CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the static gain of each input with
-its 95 % band, from the past only. Red: when it changed."""
+CAPTION = """Above: the output (dots) and its prediction one sample before. Below: the {} of each input with its 95 %
+band, from the past only. Red: when it changed, of a gradual change the beginning and the end."""
 
 
 def number(value: float) -> str:
@@ -110,8 +109,9 @@ def others(answer: Identification) -> list[str]:
 
 def curve(answer: Identification) -> str:
     """What the curve is made of."""
+    first, rest = ", ".join(answer.cause.products[:3]), len(answer.cause.products) - 3
     nats = f"{answer.cause.curve[0]:.0f} nats over a straight line"
-    return f"the effects depend on the working point ({', '.join(answer.cause.products)}; {nats})"
+    return f"the effects depend on the working point ({first}{f' and {rest} more' if rest > 0 else ''}; {nats})"
 
 
 def sentences(answer: Identification) -> list[str]:
@@ -180,17 +180,16 @@ def commands(answer: Identification) -> list[str]:
     each = {"y": roles.output, "u": ",".join(model.input_names), "model": arx_text(model), "time": roles.clock}
     each |= {"dt": interval(roles)} if roles.clock else {}
     given = {name: f"--{name} {shlex.quote(value)}" for name, value in each.items() if value}
-    files, options, toml = shlex.join(answer.source), roles.options, shlex.quote(f"{stem(answer.source)}.toml")
+    files, options, toml = (
+        shlex.join(answer.source),
+        roles.options,
+        shlex.quote(f"{PurePath(answer.source[0]).stem}.toml"),
+    )
     found = " ".join(text for name, text in given.items() if name != "model")
     return [
         *(f"driftfit {verb} {files} {' '.join(given.values())}{options}" for verb in ("track", "detect")),
         f"driftfit identify {files} {found}{options} --quiet --serve {toml} && driftfit serve {toml}",
     ]
-
-
-def stem(source: Sequence[str]) -> str:
-    """The name of the first file, without its folder and ending."""
-    return PurePath(source[0]).stem
 
 
 def interval(roles: Roles) -> str:
@@ -200,13 +199,14 @@ def interval(roles: Roles) -> str:
 
 def unit(answer: Identification | ManyIdentified) -> str:
     """The unit of a service, as TOML; of records a pattern, which makes one of every topic."""
-    roles, match = answer.roles, stem(answer.source) if isinstance(answer, Identification) else "{unit}"
+    roles, match = answer.roles, PurePath(answer.source[0]).stem if isinstance(answer, Identification) else "{unit}"
     own = dict[str, Any](match=match, y=roles.output, u=answer.model.input_names)
     timed = roles.clock is not None and isinstance(roles.dt, str) and Clock.of(roles.dt).duration is not None
     own |= {"time": roles.clock, "dt": roles.dt} if timed else {}
     own |= {"model": repr(answer.model), "tracker": "AdaptiveKalman()"}
     text = "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in own.items())
-    return f"[[unit]]\n{text}alarm = {WEEKLY if timed else '{}'}\n"
+    every = ' every = "1 week" ' if timed else ""
+    return f"[[unit]]\n{text}alarm = {{{every}}}\n"
 
 
 def effect(answer: Identification, one: Effect) -> str:
@@ -227,19 +227,8 @@ def lines(answer: Identification) -> list[tuple[str, str]]:
     said = [f"{head}: {'; '.join(each)}." for head, each in
             (("Data", answer.notes), ("Not decided", answer.undecided)) if each]  # fmt: skip
     said = [line for text in (*chosen(answer), *columns(answer.roles), *said) for line in wrap(text, WIDTH - 1)]
-    copied = [part for line in commands(answer) for part in joined(line)]
-    return [(style, f" {line}") for style, line in
-            (*found, *(("", one) for one in said), *(("dim", one) for one in copied))]  # fmt: skip
-
-
-def joined(command: str) -> list[str]:
-    """A command in lines that a shell joins, and that are not wrapped once more."""
-    found = [""]
-    for part in re.split(r"(?= --| &&)", command):
-        if found[-1] and len(found[-1]) + len(part) > WIDTH - 4:
-            found[-1:] = [f"{found[-1]} \\", " "]
-        found[-1] += part
-    return found
+    copied = [("dim", one) for one in commands(answer)]
+    return [(style, f" {line}") for style, line in (*found, *(("", one) for one in said), *copied)]
 
 
 def finite(value: Any) -> Any:
@@ -270,20 +259,23 @@ def as_json(answer: Identification) -> dict[str, Any]:
 
 
 def figure(answer: Identification) -> Figure:
-    """The picture of the page: the output with its prediction, and the static gain of the first four inputs."""
+    """The picture of the page: the output with its prediction, and the effects of the first four inputs."""
     run, shown = answer.track, answer.model.input_names[:4]
     drawn, axes = panels(None, (9.5, 2.4 + 1.6 * max(len(shown), 1)), 1 + len(shown), sharex=True)
     draw_prediction(axes[0], run)
     at = np.arange(settled(run).start, len(run), -(-len(run) // 200))
-    gains = zip(axes[1:], shown, *(x.T for x in run.dc_gain(at).band()), strict=False) if shown else ()
-    for axis, name, *band in gains:
+    own = np.reshape([x for what, x in parts(run).items() if what in shown], (-1, run.model.n)).T
+    sums = Response(*spread(lambda theta: theta @ own, *taken(run, at)))
+    gains = sums if answer.memory.root or not shown else run.dc_gain(at)
+    for axis, name, *band in zip(axes[1:], shown, *(x.T for x in gains.band()), strict=False):
         axis.fill_between(run.time[at], *band, color=BLUE, alpha=0.2, lw=0)
         axis.plot(run.time[at], np.mean(band, axis=0), color=BLUE, lw=1.3)
         axis.set_ylabel(f"effect of\n{name}")
         axis.grid(alpha=0.25, lw=0.5)
         frame(axis, np.clip(band, *np.nanpercentile(band, (2.0, 98.0))))
         for move in (one for one in answer.moves if one.what == name and one.kind != "wandering"):
-            axis.axvline(run.time[move.at], color=RED, lw=1.0)
+            for t in (move.at, move.end) if move.kind == "gradual" else (move.at,):
+                axis.axvline(run.time[t], color=RED, lw=1.0)
     axes[-1].set_xlabel(time_label(run))
     for axis in axes:
         date_axis(axis, run)
@@ -319,7 +311,7 @@ def body(answer: Identification) -> list[str]:
     open_ = [*answer.undecided, f"{p_equals(answer.verdict.p)} is that of a test after a selection"]
     return [
         section("What, since when, how large", _listed([*sentences(answer), *each])),
-        section("The picture", picture(figure(answer), answer.track, CAPTION)),
+        section("The picture", picture(figure(answer), answer.track, CAPTION.format(answer.effect))),
         section("How good", _errors(answer)),
         section("Time or working point", f"<p>Nats over constants: {escape(', '.join(leads))}.</p>{curve}"),
         section("What was chosen, and what came second", _listed([*chosen(answer), *columns(answer.roles)])),
@@ -407,7 +399,7 @@ class Identification(Printed):
     def curve(self) -> Track:
         """A Hammerstein-Wiener model with constants and a curve of each input that bends, of all if the output does."""
         model, bent = self.model, "".join(self.cause.of)
-        ends = {name: (float(f"{np.nanmin(x):.3g}"), float(f"{np.nanmax(x):.3g}"))
+        ends = {name: (float(np.nanmin(x)), float(np.nanmax(x)))
                 for name, x in zip(model.input_names, self.track.u.T, strict=True)}  # fmt: skip
         bases = [Legendre(3, ends[name]) if f"[{name}]" in bent or "[" not in bent else None for name in ends]
         nb, nk = zip(*model.lags, strict=True)

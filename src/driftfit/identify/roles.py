@@ -137,7 +137,7 @@ def roles(
             raise ValueError(f"identify: no column {name!r}; {near(name, frame.columns)}")
     numbers, texts = _numbers(frame)
     given = {y, by, *(u or ())}
-    clock, axis, zone, why = _clock(frame, numbers, texts, time, given)
+    clock, axis, zone, why = _clock(frame, numbers, texts, time, given, wanted or Wanted(()))
     why |= dict.fromkeys(not_u, "left out by --not-u")
     why |= {name: "labels of 0 and 1" for name, x in numbers.items() if name not in given and _is_label(x)}
     left = [name for name in numbers if name not in (clock, by, *why)]
@@ -166,7 +166,7 @@ def roles(
         else:
             kept.append(name)
     key, by = _key(frame, [name for name in texts if name not in not_u], by, axis)
-    why |= {name: "text" for name in texts if name != by}
+    why |= {name: "text, see --dates and --by" for name in texts if name != by}
     U = np.column_stack([numbers[name] for name in kept]) if kept else np.zeros((len(frame), 0))
     refused = {name: refused[name] for name in (y, *kept) if refused[name]}
     missing = int(np.sum(~np.isfinite(numbers[y])) + np.sum(~np.isfinite(U))) - sum(refused.values())
@@ -197,6 +197,8 @@ def _in_order(found: Roles) -> Roles:
     order = np.lexsort((found.time, found.groups))
     order = order[np.isfinite(found.time[order])]
     time, groups = found.time[order], found.groups[order]
+    if np.bincount(groups, minlength=1).max() < 2:
+        raise NoAnswerError(f"no record has two rows with a time (--time {found.clock}, --by {found.by}).")
     new = np.append(True, (time[1:] != time[:-1]) | (groups[1:] != groups[:-1]))
     dt = median_interval(time[new], found.zone)[1] if found.dt is None and new.sum() > 1 else found.dt
     return replace(found.rows(order[new]), dt=dt, dropped=len(found.time) - int(new.sum()))
@@ -228,18 +230,18 @@ def _numbers(frame: Any) -> tuple[dict[str, Array], list[str]]:
 
 
 def _clock(
-    frame: Any, numbers: dict[str, Array], texts: list[str], time: str | None, given: set[Any]
+    frame: Any, numbers: dict[str, Array], texts: list[str], time: str | None, given: set[Any], wanted: Wanted
 ) -> tuple[str | None, Array | None, str | None, dict[str, str]]:
     """(name of the time, times, zone, other clocks with the reason)."""
     found: dict[str, tuple[Array, str | None]] = {}
     for name in [*texts] if time is None else {time} & {*texts}:
         try:
-            found[name] = times_of_column(frame[name], "identify", 1)
+            found[name] = times_of_column(frame[name], "identify", 1, wanted.dates, wanted.missing)
             texts.remove(name)
         except (ValueError, TypeError) as error:
             if time is not None:
                 raise ValueError(f"identify: --time {time}: {error}") from None
-    free = () if time is not None else numbers.keys() - given
+    free = () if time is not None or len(frame) < FEWEST else numbers.keys() - given
     found |= {name: (x, None) for name, x in numbers.items() if name == time or (name in free and _counts(x))}
     clock = next(iter(found), None)
     return clock, *found.get(clock or "", (None, None)), {name: "a second clock" for name in found if name != clock}
@@ -247,7 +249,7 @@ def _clock(
 
 def _counts(x: Array) -> bool:
     """Whether a column of numbers is complete and increases by even steps nearly everywhere."""
-    step, middle = np.diff(x), float(np.median(np.diff(x))) if len(x) > 2 else 0.0
+    step, middle = np.diff(x), float(np.median(np.diff(x)))
     return bool(np.mean(np.abs(step - middle) < 0.5 * middle) > 0.8 and np.mean(step > 0.0) > 0.99)
 
 

@@ -43,16 +43,10 @@ class Scores:
         edges = np.linspace(0, N, B + 1).astype(int)
         self.count = np.diff(edges).astype(float)
         self.G = np.stack([Z[a:b].T @ Z[a:b] for a, b in itertools.pairwise(edges)])
-        kept = [np.exp(-1.0 / (f * B)) for f in memories if f * N >= FEWEST]
-        self.rest = np.zeros((len(kept), *self.G.shape))
-        for C, lam in zip(self.rest, kept, strict=True):  # the blocks before, and those after
-            for b in range(1, B):
-                C[b] = lam * (C[b - 1] + self.G[b - 1])
-            after = np.zeros_like(C[0])
-            for b in range(B - 2, -1, -1):
-                after = lam * (after + self.G[b + 1])
-                C[b] += after
-        self.rest += RIDGE * np.eye(self.p + 1)
+        apart = np.abs(np.subtract.outer(np.arange(B), np.arange(B)))
+        shares = [np.exp(-apart / (f * B)) * (apart > 0) for f in memories if f * N >= FEWEST]
+        self.rest = np.tensordot(np.stack(shares), self.G, 1)
+        self.rest[..., range(self.p + 1), range(self.p + 1)] += RIDGE
         self.floor = 0.0
 
     def refer(self, S: list[int]) -> None:

@@ -74,25 +74,13 @@ class Errors(NamedTuple):
     lagged_ls: Array
     constant_arx: Array
     scored: Array
+    arx: Array
+    """(T,): records of constant ARX, as of `constant_least_squares`."""
 
 
 @lru_cache(16)
 def _constant_arx(inputs: int) -> ARX:
     return ARX(2, 1 if inputs else 0, inputs=inputs, intercept=True)
-
-
-def constant_arx(record: Record) -> Array:
-    """Constants of ARX(2, 1 per input) with intercept over a record: (T,) records as of `constant_least_squares`."""
-    y = _usable(record.y)
-    gaps, unused = record.known.interval, np.broadcast_to(record.known.noise == np.inf, len(y)).copy()
-    unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
-    gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
-    known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
-    return constant_least_squares(_constant_arx(record.u.shape[1]), Record(y, record.u, known))
-
-
-def _usable(y: Array) -> Array:
-    return np.where(np.abs(y) < LARGEST, y, np.nan)
 
 
 def errors(run: Track, record: Record, burn: int | None = None, steady: Array | None = None) -> Errors:
@@ -102,8 +90,13 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     default those of `left_at_start`. ``record`` is what they learn from (`Track.used_record`); ``steady`` are the
     constants of the run, if they are known.
     """
-    y, u, arx = _usable(record.y), record.u, constant_arx(record)
+    y, u = np.where(np.abs(record.y) < LARGEST, record.y, np.nan), record.u
     steady = constant_least_squares(run.model, record) if steady is None else steady
+    gaps, unused = record.known.interval, np.broadcast_to(record.known.noise == np.inf, len(y)).copy()
+    unused[1:] |= unused[:-1] & np.isfinite(y[:-1])  # an input that may be to blame is the lag of the next sample
+    gaps = np.where(gaps > 0.0, gaps, 1.0)  # 0 before the lags were filled
+    known = record.known.changed(interval=gaps, noise=np.where(unused, np.inf, 1.0))
+    arx = constant_least_squares(_constant_arx(u.shape[1]), Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     lagged = _with_lags(run.model, steady, y, constant, record.known)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
@@ -113,7 +106,7 @@ def errors(run: Track, record: Record, burn: int | None = None, steady: Array | 
     scored = np.asarray(np.cumsum(given) - given >= (left_at_start(run) if burn is None else burn))
     for error in own if run.model.hidden is None else (own[0], own[1], own[4]):
         scored &= np.isfinite(error)
-    return Errors(*own, scored)
+    return Errors(*own, scored, arx)
 
 
 def _with_lags(model: Model, steady: Array, y: Array, constant: Array, given: Known) -> Array:

@@ -33,19 +33,13 @@ import numpy as np
 
 from driftfit.engine.compile_notice import PATIENCE
 from driftfit.engine.disk_cache import folder
-from driftfit.engine.kernel import Array, Driver
-from driftfit.engine.outlined import outlined
-from driftfit.engine.phases import looking
-from driftfit.engine.tiles import as_compiled, tile_type
-from driftfit.engine.tracker_part import tracker_part
 from driftfit.judge.changes.null import Lags
 from driftfit.judge.changes.words import events
 from driftfit.judge.evidence import REJECTED, judged_rows
 from driftfit.judge.regressors import Rows
-from driftfit.models.arx import ARX
 from driftfit.run.parallel_lanes import cores
-from driftfit.run.program import Program, progress_bar
-from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.run.program import progress_bar
+from driftfit.trackers.forms.diffuse import machine_learn, machine_root, machine_wander
 
 Result = TypeVar("Result")
 FIRST = 5
@@ -57,10 +51,6 @@ BATCH = 0.2
 
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """A process has one core: threads of its linear algebra would wait for one another, and take twice the time."""
-
-MODULE = "driftfit.judge.on_all_cores"
-SAMPLES = 300
-"""Of the record that is judged so that the verdict is compiled."""
 
 
 def on_all_cores(
@@ -113,9 +103,9 @@ def available() -> bool:
     return Path(sys.executable or "").stem.lower().startswith(("python", "pypy"))
 
 
-def _python(function: str, **streams: int) -> Popen[bytes]:
+def _python(function: str, **streams: Any) -> Popen[bytes]:
     """A new interpreter that runs a function of this module."""
-    code = f"from {MODULE} import {function}; {function}()"
+    code = f"from {__name__} import {function}; {function}()"
     path = os.pathsep.join(filter(None, sys.path))
     return Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path} | ONE_THREAD, **streams)
 
@@ -196,19 +186,11 @@ def compiling_beside() -> Iterator[Callable[[], object]]:
 
 
 def fill() -> None:
-    """Compile a step of the default tracker, which is the same for all models, and the verdict: of an autoregression
-    whose level jumps.
-    """
-    program = Program(ARX(1, 0, intercept=True), AdaptiveKalman())
-    look = outlined(looking(program.steps))
-
-    @Driver
-    def only(tile: Array) -> None:
-        look(tracker_part(tile[0]))
-
-    only.entry(tile_type(as_compiled(program.tile())))
-    at = np.arange(1, SAMPLES)
-    y = np.random.default_rng(0).normal(size=SAMPLES) + 2.0 * (np.arange(SAMPLES) > at.mean())
+    """Compile what the start of a tracker calls, and the verdict: of an autoregression whose level jumps."""
+    for one in (machine_learn, machine_root, machine_wander):
+        one.load()
+    at = np.arange(1, 300)
+    y = np.random.default_rng(0).normal(size=len(at) + 1) + 2.0 * (np.arange(len(at) + 1) > at.mean())
     lags = Lags(np.arange(1), at[:, None] - 2, np.ones((len(at), 1)))
     rows = Rows(at, np.column_stack([y[:-1], np.ones(len(at))]), y[1:], None, lags, np.ones(len(at)))
     if found := judged_rows(rows, REJECTED):

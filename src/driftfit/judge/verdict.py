@@ -366,7 +366,7 @@ def judged(known: Evidence) -> Verdict:
     happened = () if found is None or not found.rejected else events(found, names, at, run.time_text)
     scored = known.errors.scored
     y = run.y[scored]
-    error, *others = (rounded(each[scored], y) for each in known.errors[:-1])
+    error, *others = (rounded(each[scored], y) for each in known.errors[:-2])
     rivals = tuple(paired(name, rival, error) for name, rival in zip(RIVALS, others, strict=True))
     lags = () if found is None else found.model.noise.lags
     loud = None if found is None or found.rejected else loudest(found.model.noise.e, found.model.noise.ranks)

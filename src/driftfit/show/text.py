@@ -29,7 +29,7 @@ def _console(parts: tuple[Any, ...], **options: Any) -> Console:
     """
     fixed: dict[str, Any] = dict.fromkeys(("force_jupyter", "force_terminal", "legacy_windows"), False)
     console = Console(file=StringIO(), width=WIDTH, height=100, **fixed, **options)
-    console.print(*parts)
+    console.print(*parts, crop=False)
     return console
 
 
