@@ -37,14 +37,7 @@ import numpy as np
 from driftfit.bank import change as changes_
 from driftfit.bank import reduction as reductions
 from driftfit.bank.change import Change
-from driftfit.bank.layout import (
-    COUNTER,
-    HEAD,
-    MOST_REPORTED,
-    ROW,
-    SAMPLE,
-    WHOLE,
-)  # fmt: skip
+from driftfit.bank.layout import COUNTER, HEAD, MOST_REPORTED, ROW, SAMPLE, WHOLE
 from driftfit.bank.leaves import forget
 from driftfit.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.bank.machine.advance import begin, limit_forgetting
@@ -55,7 +48,7 @@ from driftfit.bank.reduction import Beam, Decide, Hybrid, Reduction, Resample, S
 from driftfit.bank.sensor import Sensor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import as_numbers, check_numbers, factor, matrix, vector
+from driftfit.engine.settings import as_numbers, check_numbers, factor, matrix, vector, warn
 from driftfit.models.base import Model
 from driftfit.readings.repeats import unresolved
 from driftfit.trackers.base import Tracker
@@ -145,11 +138,9 @@ class Bank(Tracker):
                 "Hybrid(9), or Decide(1, force=True)."
             )
         if "frozen" in kinds and self.independent:
-            import warnings
-
-            warnings.warn(
+            warn(
                 "Bank: a frozen sensor stays frozen for a while, but events are independent here; give transition=.",
-                stacklevel=4,
+                UserWarning,
             )
 
     @property

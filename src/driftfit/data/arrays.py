@@ -196,5 +196,4 @@ def noise_of_outputs(weights: Any, T: int, ny: int) -> Array:
         return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)
     if given.shape != (T, ny):
         raise ValueError(f"weights must be one number, ({T},) or ({T}, {ny}); got shape {given.shape}.")
-    noise: Array = noise_of(given.ravel(), given.size).reshape(T, ny)
-    return noise
+    return np.asarray(noise_of(given.ravel(), given.size).reshape(T, ny))

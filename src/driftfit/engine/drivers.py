@@ -57,10 +57,6 @@ CONTIGUOUS = 0x0001 | 0x0100
 """NumPy's flags of arrays that are contiguous by rows, and aligned: of these the compiler's type is that of numbers."""
 
 
-def no_preparation(L: int) -> None:
-    """Steps that call nothing by symbol need none."""
-
-
 @kernel
 def nothing_remembered(s: State, signal: int, age: int, l: int) -> None:
     """Nothing of an input is kept after its sample."""
@@ -69,7 +65,6 @@ def nothing_remembered(s: State, signal: int, age: int, l: int) -> None:
 class ModelSteps(NamedTuple):
     """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
     ``foreseeing(forecast)``, where phi contains y, is the step that writes y_hat, e and s before y is seen, for a gate.
     ``apply`` stores the input of a sample, ``s.u``, after the sample, and leaves the record as if it had come with the
     output; None if an output needs the input of its own sample. An input is remembered for ``ages`` samples after its
@@ -80,7 +75,6 @@ class ModelSteps(NamedTuple):
 
     regress: Step
     push: Step
-    ready: Callable[[int], None] = no_preparation
     foreseeing: Callable[[Step], Step] | None = None
     apply: Step | None = None
     ages: int = 0
@@ -241,8 +235,6 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: A
     ``update_one`` the same for a single float u (`Drivers.updater`); both take what is known from the fields
     ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
-    ready = model.ready
-    ready(1)
     with compiling():
         for machine in tracker.machines:
             machine.load()
@@ -270,7 +262,6 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std", gate: A
             _check_shapes(m, L, len(theta), y, u, known)
             if len(out) != 1 or theta.shape[1:] != tile["theta"].shape[1:]:
                 raise ValueError(f"run: out must have one row beside theta, which has shape {theta.shape}.")
-        ready(L)
         given = as_compiled(tile) if opened else tile, y, u, known, out, theta
         done: int = run.of_kind((tile.dtype, out.dtype), given) if plain else run(*given)
         return done

@@ -179,8 +179,7 @@ class ARX(CountedInputs):
         A, _ = self.polynomials(theta)
         from scipy import signal  # this import takes a third of a second, and only forecasts need it
 
-        response: Array = signal.lfilter([1.0], A, np.eye(1, h)[0])
-        return response
+        return np.asarray(signal.lfilter([1.0], A, np.eye(1, h)[0]))
 
     def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
         """A(z) = [1, A_1, ..], A_i = -a_i, and, per input, B(z) = [0 (nk times), b_1, ..], in powers of z^-1.

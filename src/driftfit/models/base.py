@@ -112,8 +112,7 @@ class Model(Settings, ABC):
 
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
-        response: Array = np.eye(1, h)[0]
-        return response
+        return np.asarray(np.eye(1, h)[0])
 
     @property
     def output_lags(self) -> int | None:

@@ -278,8 +278,7 @@ class PolynomialModel(LinearisedTransfer):
         from scipy import signal  # this import takes a third of a second, and only forecasts need it
 
         parts = self.parts(theta)
-        response: Array = signal.lfilter(parts["C"], np.convolve(parts["A"], parts["D"]), np.eye(1, h)[0])
-        return response
+        return np.asarray(signal.lfilter(parts["C"], np.convolve(parts["A"], parts["D"]), np.eye(1, h)[0]))
 
     def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
         parts = self.parts(theta)

@@ -40,8 +40,7 @@ class Lane(NamedTuple):
 
     def written(self, name: str) -> Array:
         """A field of the output of the driver."""
-        field: Array = self.out[name][..., self.lane]
-        return field
+        return np.asarray(self.out[name][..., self.lane])
 
     def alone(self, program: Program) -> Lane:
         """A copy in a separate tile, without the other series."""

@@ -136,8 +136,7 @@ class Track(Plain, OfRecord):
     @property
     def last_var(self) -> Array:
         """Variances of the parameters after the last sample, (n,): a view."""
-        var: Array = self._lane.tile["var"][0, :, self._lane.lane]
-        return var
+        return np.asarray(self._lane.tile["var"][0, :, self._lane.lane])
 
     def in_rows(self, name: str) -> Array:
         """A field of the driver's output; replays the record, once, if only theta was kept."""

@@ -100,8 +100,7 @@ class SineOffset(_Sine):
     """A sine wave of ``omega`` radians per sample around ``start``."""
 
     def path(self, T: int, rng: np.random.Generator) -> Array:
-        wave: Array = self.start + self.amplitude * np.sin(self.omega * np.arange(T) + self.phase)
-        return wave
+        return np.asarray(self.start + self.amplitude * np.sin(self.omega * np.arange(T) + self.phase))
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,11 @@ def simulate(
             raise ValueError(f"simulate: u must be ({T},); got shape {drive.shape}.")
         v = input_block(model.into, drive, tc)
         w = _linear(model, ta, tb, v, error)
-        y0 = _inverted(model, td, w, limit, unstable)
+        try:
+            y0 = invert(model.out, td, w, limit)
+        except NotMonotoneError as failure:
+            more = "" if unstable is None else f" The linear block is unstable from sample {unstable} on."
+            raise NotMonotoneError(f"{failure}{more}") from None
     sigma = 0.0 if snr_db is None else float(np.std(y0) * 10.0 ** (-snr_db / 20.0))
     y = y0 + sigma * rng.normal(size=T) if sigma else y0.copy()
     return Simulated(model, y, drive, y0, w, v, ta, tb, tc, td, sigma, unstable)
@@ -175,15 +179,6 @@ def _closed(
         v[t] = input_block(model.into, drive[t : t + 1], c[t : t + 1])[0]
         y[t] = invert(model.out, d[t : t + 1], w[t : t + 1], limit, first=t)[0]
     return drive, v, w, y
-
-
-def _inverted(model: HammersteinWiener, d: Array, w: Array, limit: float, unstable: int | None) -> Array:
-    try:
-        return invert(model.out, d, w, limit)
-    except NotMonotoneError as error:
-        if unstable is None:
-            raise
-        raise NotMonotoneError(f"{error} The linear block is unstable from sample {unstable} on.") from None
 
 
 def first_unstable(a: Array) -> int | None:

@@ -230,5 +230,4 @@ def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:
             f"{owner}: drift with a column for each parameter must be ({T}, {n}), for {', '.join(names)}; got shape "
             f"{factors.shape}."
         )
-    roots: Array = np.sqrt(factor("drift", factors.ravel(), factors.size)).reshape(T, n)
-    return roots
+    return np.asarray(np.sqrt(factor("drift", factors.ravel(), factors.size)).reshape(T, n))

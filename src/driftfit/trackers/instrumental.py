@@ -145,8 +145,7 @@ def learning(refined: bool) -> Step:
             s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
         learn_settling_scale(s, l)
 
-    step: Step = learn
-    return step
+    return learn  # type: ignore[no-any-return]
 
 
 @kernel

@@ -76,8 +76,7 @@ def _repeated(move: Step, timed: bool) -> Step:
             left -= 1.0
         drift_matrix(s, l)
 
-    step: Step = predict
-    return step
+    return predict  # type: ignore[no-any-return]
 
 
 @kernel

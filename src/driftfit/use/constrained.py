@@ -74,13 +74,11 @@ class Constrained(Printed):
 
     @cached_property
     def std(self) -> Array:
-        std: Array = np.sqrt(np.maximum(np.einsum("tii->ti", self._P), 0.0))
-        return std
+        return np.asarray(np.sqrt(np.maximum(np.einsum("tii->ti", self._P), 0.0)))
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) within the constraints after sample t."""
-        cov: Array = self._P[t].copy()
-        return cov
+        return np.asarray(self._P[t].copy())
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n): equal-tailed bands, which never leave a bound of a single parameter."""

@@ -51,13 +51,11 @@ class Transfer:
 
     @property
     def a_std(self) -> Array:
-        std: Array = np.sqrt(np.diag(self.cov)[: len(self.a)])
-        return std
+        return np.asarray(np.sqrt(np.diag(self.cov)[: len(self.a)]))
 
     @property
     def b_std(self) -> Array:
-        std: Array = np.sqrt(np.diag(self.cov)[len(self.a) :])
-        return std
+        return np.asarray(np.sqrt(np.diag(self.cov)[len(self.a) :]))
 
     def _mapped(self, f: Any) -> tuple[Array, Array]:
         """f of (a, b), and its covariance."""

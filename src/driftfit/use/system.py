@@ -348,8 +348,7 @@ class LiveSystem:
 
     def poles(self) -> Array:
         """Poles, (na,) complex, the largest first."""
-        found: Array = poles(self)[0]
-        return found
+        return np.asarray(poles(self)[0])
 
     def largest_pole(self) -> Response:
         """Magnitude of the largest pole, with its standard deviation; below 1 the system is stable."""

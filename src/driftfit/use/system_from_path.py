@@ -194,8 +194,7 @@ class ExpAutoregression(NamedTuple):
     def theta(self, y: Any, delay: int = 1) -> Array:
         """Coefficients a_i + b_i e^{-r y_{k-d}^2} along a record, (T, n)."""
         past = _lagged(as_output(y), delay)
-        theta: Array = self.a + self.b * np.exp(-self.r * past[:, None] ** 2)
-        return theta
+        return np.asarray(self.a + self.b * np.exp(-self.r * past[:, None] ** 2))
 
 
 def exp_autoregression(y: Any, n: int, delay: int = 1, level: float = 0.95) -> ExpAutoregression:
@@ -316,8 +315,7 @@ def rational_model(y: Any, phi: Any, psi: Any) -> Rational:
     start = np.r_[np.linalg.lstsq(top, output, rcond=None)[0], np.zeros(m)]
 
     def residual(theta: Array) -> Array:
-        found: Array = output - top @ theta[:n] / (1.0 + below @ theta[n:])
-        return found
+        return np.asarray(output - top @ theta[:n] / (1.0 + below @ theta[n:]))
 
     def slope(theta: Array) -> Array:
         g = 1.0 + below @ theta[n:]

@@ -31,7 +31,11 @@ def plot_hypotheses(
     figure, axes = panels(ax, (9.0, 1.4 * n + 2.6), n + 1, sharex=True, heights=[*[1.4] * n, 1.6])
     for i in range(n):
         draw_parameter(axes[i], run, i, level)
-    stack(axes[n], run.time, np.nan_to_num(latest), names)
+    below, colours = axes[n], [COLOURS[k % len(COLOURS)] for k in range(len(names))]
+    below.stackplot(run.time, np.nan_to_num(latest).T, labels=names, colors=colours, step="mid", linewidth=0)
+    below.set_ylim(0.0, 1.0)
+    below.set_ylabel("events")
+    below.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=min(len(names), 4), fontsize=8, frameon=False)
     for event in events:
         if event.kind == "change":
             for axis in axes[:n]:
@@ -44,15 +48,6 @@ def plot_hypotheses(
     date_axis(axes[n], run)
     figure.align_ylabels(axes)
     return figure
-
-
-def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
-    """Probabilities of events, stacked, with the normal course at the bottom."""
-    colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
-    axis.stackplot(time, p.T, labels=names, colors=colours, step="mid", linewidth=0)
-    axis.set_ylim(0.0, 1.0)
-    axis.set_ylabel("events")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=min(len(names), 4), fontsize=8, frameon=False)
 
 
 def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:

@@ -6,7 +6,6 @@ probabilities are conditional on the decisions.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,6 +21,7 @@ from driftfit.bank.results.mixture import Mixture, mixture_of, undecided
 from driftfit.bank.results.pictures import plot_hypotheses
 from driftfit.bank.results.smoothed import SmoothedMixture
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 from driftfit.run.result import Track
 from driftfit.smooth.changes import dated
 
@@ -84,10 +84,10 @@ class Hypotheses:
         self.lags = self.tracker.reported_levels
         self.sensors = len(self.tracker.all_sensors)
         if self.impossible:
-            warnings.warn(
+            warn(
                 f"{self.impossible} samples were impossible under every hypothesis of the bank and were not used. Give "
                 "each event that may happen a probability above 0 in transition= and prob=.",
-                stacklevel=3,
+                UserWarning,
             )
 
     def __repr__(self) -> str:
@@ -196,11 +196,12 @@ class Hypotheses:
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
-        bank = self.tracker
+        bank, time = self.tracker, self.run.time
         given = Probabilities(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
         )  # fmt: skip
-        return self._timed([self._early(event, threshold) for event in all_of(given, threshold)])
+        early = [self._early(event, threshold) for event in all_of(given, threshold)]
+        return [event.timed(lambda sample: time[sample]) for event in early]
 
     def _early(self, event: Event, threshold: float) -> Event:
         """A fault may have been detected earlier than the last sample at which it was remembered."""
@@ -211,11 +212,6 @@ class Hypotheses:
             if date + lag < len(self.run) and self.lag_prob[date + lag, k, j :: self.sensors].sum() > threshold:
                 return replace(event, span=event.span._replace(known=date + lag))
         return event
-
-    def _timed(self, events: list[Event]) -> list[Event]:
-        """The events with times, if the record has them."""
-        time = self.run.time
-        return [event.timed(lambda sample: time[sample]) for event in events]
 
     def table(self, threshold: float = 0.5) -> Any:
         """`events` as a polars table, with the change of every parameter and its standard error."""

@@ -350,8 +350,7 @@ def times(column: pa.ChunkedArray) -> Array:
     """Floats, or datetime64 in UTC; NaN or NaT where there is none."""
     if not pa.types.is_timestamp(column.type):
         return numbers(column)
-    instants: Array = column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]")
-    return instants
+    return np.asarray(column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]"))
 
 
 def results(task: Task, found: Advanced) -> dict[str, pa.Array]:

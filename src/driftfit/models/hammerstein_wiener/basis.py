@@ -34,37 +34,38 @@ from driftfit.models.hammerstein_wiener import curve_kernels
 
 
 @lru_cache
-def _over(evaluate: Any) -> Driver:
-    """A compiled loop of ``evaluate`` over an array."""
+def _over(functions: Any) -> Driver:
+    """A compiled loop of a kernel over an array."""
 
     @Driver
     def each(x: Array, p: Array, out: Array, slopes: Array) -> None:
-        n = out.shape[1]
         for i in range(x.shape[0]):
-            evaluate(x[i], p.ctypes.data, p.shape[0], out[i].ctypes.data, slopes[i].ctypes.data, n, 1)
+            functions(x[i], p, out[i], slopes[i])
 
     return each
 
 
-def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> Array:
-    """The functions of a compiled routine at x (k,), and their derivatives, (2, k, n); p may be overwritten."""
-    evaluate.load()
+def values_and_slopes(functions: Any, x: Array, p: Array, n: int) -> Array:
+    """The functions of a kernel at x (k,), and their derivatives, (2, k, n); p may be overwritten."""
     found = np.empty((2, len(x), n))
-    _over(evaluate)(np.ascontiguousarray(x), p, *found)
+    _over(functions)(np.ascontiguousarray(x), p, *found)
     return found
 
 
 class Basis(Settings, ABC):
     """A set of functions of one variable, without a constant.
 
-    It has `value(x)` and `derivative(x)`, (..., n) each, and for steps the compiled routine ``evaluate``. Its numbers
-    p (``parameters``) are stored in the record, so another range needs no new compilation.
+    It has `value(x)` and `derivative(x)`, (..., n) each, and for steps the kernel ``functions``. Its numbers p
+    (``parameters``) are stored in the record, so another range needs no new compilation.
     """
 
-    code: ClassVar[int] = -1
-    """The kind, as a code of `driftfit.models.hammerstein_wiener.curve_kernels`."""
+    functions: ClassVar[Any]
+    """The kernel of `driftfit.models.hammerstein_wiener.curve_kernels` that computes them and their derivatives, as a
+    static method: a kernel alone would be bound to the basis."""
     sequence: ClassVar[tuple[int, str] | None] = None
     """How many numbers come before those of a setting that is a sequence, on the command line, and its name."""
+    letter: ClassVar[str] = "f"
+    """With which the names of the functions begin."""
     adaptive: ClassVar[bool] = False
     """Whether the functions depend on their own coefficients, which are then fed back at every sample."""
 
@@ -74,24 +75,9 @@ class Basis(Settings, ABC):
         """Number of functions."""
 
     @property
-    def evaluate(self) -> Any:
-        """The compiled routine that evaluates the functions and their derivatives."""
-        return curve_kernels.evaluate
-
-    @property
-    def kind(self) -> tuple[Any, int]:
-        """The compiled routine and the code, from which steps are made."""
-        return self.evaluate, self.code
-
-    @property
-    def own_numbers(self) -> Array:
-        """Numbers of the basis, (k,)."""
-        return np.zeros(0)
-
-    @property
     def parameters(self) -> Array:
-        """The array p of the compiled functions: the code of the kind, and the numbers of the basis."""
-        return np.concatenate([[float(self.code)], self.own_numbers])
+        """Numbers p of the basis, (k,); a zero where it has none."""
+        return np.zeros(1)
 
     @property
     def expected(self) -> tuple[float, float]:
@@ -150,7 +136,7 @@ class Basis(Settings, ABC):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the functions, in the order of the coefficients."""
-        return tuple(f"f{k + 1}" for k in range(self.n))
+        return tuple(f"{self.letter}{k + 1}" for k in range(self.n))
 
     def value(self, x: Any) -> Array:
         """The functions at x (...), as (..., n)."""
@@ -166,7 +152,7 @@ class Basis(Settings, ABC):
 
     def _at(self, x: Any) -> Array:
         points = np.asarray(x, dtype=float)
-        found = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
+        found = values_and_slopes(self.functions, points.ravel(), self.parameters.copy(), self.n)
         return found.reshape(2, *points.shape, self.n)
 
     @classmethod
@@ -192,7 +178,7 @@ class Polynomial(Basis):
 
     degree: int
 
-    code: ClassVar[int] = curve_kernels.POWERS
+    functions: ClassVar[Any] = staticmethod(curve_kernels.powers)
 
     def __post_init__(self) -> None:
         self._set("degree", whole("Polynomial", "degree", self.degree, 1))
@@ -223,7 +209,6 @@ class _Orthogonal(Basis):
     degree: int
     range: Any
 
-    letter: ClassVar[str]
     sequence = (1, "range")
 
     def __post_init__(self) -> None:
@@ -244,20 +229,16 @@ class _Orthogonal(Basis):
         return low, high
 
     @property
-    def own_numbers(self) -> Array:
+    def parameters(self) -> Array:
         low, high = self.range
         return np.array([0.5 * (low + high), 0.5 * (high - low)])
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(f"{self.letter}{k + 1}" for k in range(self.degree))
 
 
 @dataclass(frozen=True)
 class Legendre(_Orthogonal):
     """Legendre polynomials P_1 .. P_degree of s = (x - middle) / half-width on ``range`` = (low, high)."""
 
-    code: ClassVar[int] = curve_kernels.LEGENDRE
+    functions: ClassVar[Any] = staticmethod(curve_kernels.legendre)
     letter: ClassVar[str] = "P"
 
 
@@ -265,7 +246,7 @@ class Legendre(_Orthogonal):
 class Chebyshev(_Orthogonal):
     """Chebyshev polynomials T_1 .. T_degree of s = (x - middle) / half-width on ``range`` = (low, high)."""
 
-    code: ClassVar[int] = curve_kernels.CHEBYSHEV
+    functions: ClassVar[Any] = staticmethod(curve_kernels.chebyshev)
     letter: ClassVar[str] = "T"
 
 
@@ -286,7 +267,7 @@ class PiecewiseLinear(Basis):
 
     knots: Any
 
-    code: ClassVar[int] = curve_kernels.HINGES
+    functions: ClassVar[Any] = staticmethod(curve_kernels.hinges)
     sequence = (0, "knots")
 
     def __post_init__(self) -> None:
@@ -302,7 +283,7 @@ class PiecewiseLinear(Basis):
         return 1 + len(self.knots)
 
     @property
-    def own_numbers(self) -> Array:
+    def parameters(self) -> Array:
         return np.array(self.knots)
 
     @property
@@ -321,7 +302,7 @@ class BSpline(Basis):
     knots: Any
     anchor: float = 0.0
 
-    code: ClassVar[int] = curve_kernels.SPLINES
+    functions: ClassVar[Any] = staticmethod(curve_kernels.splines)
     sequence = (1, "knots")
 
     def __post_init__(self) -> None:
@@ -344,11 +325,10 @@ class BSpline(Basis):
         return self.knots[0], self.knots[-1]
 
     @property
-    def own_numbers(self) -> Array:
+    def parameters(self) -> Array:
         ends = np.pad(self.knots, self.degree, mode="edge")
         p = np.concatenate([[self.degree, len(ends)], ends, np.zeros(self.degree + 1 + self.n)])
-        coded = np.concatenate([[float(self.code)], p])
-        p[-self.n :] = values_and_slopes(self.evaluate, np.array([self.anchor]), coded, self.n)[0][0]
+        p[-self.n :] = values_and_slopes(self.functions, np.array([self.anchor]), p.copy(), self.n)[0][0]
         return p
 
     @property
@@ -366,7 +346,7 @@ class Sigmoid(Basis):
     centres: Any
     width: float
 
-    code: ClassVar[int] = curve_kernels.SIGMOIDS
+    functions: ClassVar[Any] = staticmethod(curve_kernels.sigmoids)
     sequence = (1, "centres")
 
     def __post_init__(self) -> None:
@@ -378,7 +358,7 @@ class Sigmoid(Basis):
         return len(self.centres)
 
     @property
-    def own_numbers(self) -> Array:
+    def parameters(self) -> Array:
         return np.array([*self.centres, self.width])
 
     @property
@@ -431,7 +411,7 @@ class Functions(Basis):
         return 0.0
 
     @property
-    def evaluate(self) -> Any:
+    def functions(self) -> Any:
         return _together(self.values, self.slopes)
 
     @property
@@ -456,7 +436,7 @@ class Functions(Basis):
 
 @lru_cache
 def _together(values: Callable[..., Any], slopes: Callable[..., Any]) -> Any:
-    """The compiled routine of a user's two functions."""
+    """The kernel of a user's two functions."""
     first, second = (kernel(getattr(one, "py_func", one)) for one in (values, slopes))
 
     @kernel
@@ -464,7 +444,7 @@ def _together(values: Callable[..., Any], slopes: Callable[..., Any]) -> Any:
         first(x, p, out)
         second(x, p, slopes)
 
-    return curve_kernels.routine_of(both)
+    return both
 
 
 def _kinds(kind: type[Basis] = Basis) -> dict[str, type[Basis]]:

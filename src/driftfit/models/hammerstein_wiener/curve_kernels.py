@@ -1,8 +1,7 @@
-"""The compiled functions of the bases of the library, and one routine that evaluates any of them.
+"""The compiled functions of the bases of the library.
 
 A kernel ``(x, p, out, slopes)`` fills out (n,) and slopes (n,) with the functions of a basis at x and their
-derivatives; p are the numbers of the basis. `every` chooses the kernel by the code p[0]. Steps call it through
-`evaluate`, with the addresses of p, out and slopes, whose elements are ``stride`` numbers apart; it is compiled once.
+derivatives; p are the numbers of the basis.
 
 B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs is at the
 end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
@@ -10,14 +9,12 @@ end of their numbers [degree, count, knots.., scratch.., values at the anchor..]
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, exp, floats, kernel, machine
-
-POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE, SATURATION, SIGMOIDS = range(8)
+from driftfit.engine.kernel import Array, exp, kernel
 
 
 @kernel
@@ -123,7 +120,7 @@ def local_splines(x: float, p: Array, degree: int) -> int:
     return span
 
 
-@kernel
+@partial(kernel, inline=False)
 def splines(x: float, p: Array, out: Array, slopes: Array) -> None:
     order, count = int(p[0]), int(p[1])
     work, anchor = 2 + count, 2 + count + order + 1
@@ -144,38 +141,3 @@ def splines(x: float, p: Array, out: Array, slopes: Array) -> None:
                 slopes[k - 1] += slope
             if k - 2 >= 0:
                 slopes[k - 2] -= slope
-
-
-@kernel
-def every(x: float, p: Array, out: Array, slopes: Array) -> None:
-    """The functions of a basis and their derivatives."""
-    code, own = p[0], p[1:]
-    if code == POWERS:
-        powers(x, own, out, slopes)
-    elif code == LEGENDRE:
-        legendre(x, own, out, slopes)
-    elif code == CHEBYSHEV:
-        chebyshev(x, own, out, slopes)
-    elif code == HINGES:
-        hinges(x, own, out, slopes)
-    elif code == SPLINES:
-        splines(x, own, out, slopes)
-    elif code == SATURATION:
-        saturation(x, own, out, slopes)
-    elif code == SIGMOIDS:
-        sigmoids(x, own, out, slopes)
-    else:
-        dead_zone(x, own, out, slopes)
-
-
-def routine_of(function: Any) -> Any:
-    """``evaluate(x, p, count, out, slopes, n, stride)`` of a kernel (x, p, out, slopes)."""
-
-    def machine_evaluate(x: float, p: int, count: int, out: int, slopes: int, n: int, stride: int) -> None:
-        function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
-
-    machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a separate file on disk
-    return machine(machine_evaluate)
-
-
-evaluate = routine_of(every)

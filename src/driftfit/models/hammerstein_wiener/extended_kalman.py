@@ -28,12 +28,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import State, kernel
 from driftfit.engine.settings import check_numbers, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.basis import PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.structure import NUMBER, Structure, positions
+from driftfit.models.hammerstein_wiener.structure import Structure, positions
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.forms.covariance import correct, product_with, read_drift
 from driftfit.trackers.kalman import drift, drift_matrix
@@ -55,13 +55,6 @@ def structure_of(owner: str, model: Model) -> Structure:
     return structure
 
 
-def minimal_memory(model: Model) -> Array:
-    """The memory of the model with the mark that theta is xi."""
-    blocks = np.array(model.memory()["blocks"])
-    blocks[NUMBER.minimal] = 1.0
-    return blocks
-
-
 class Minimal(Tracker):
     """A tracker whose theta is xi, the minimal parameters of a `HammersteinWiener` model."""
 
@@ -71,7 +64,7 @@ class Minimal(Tracker):
     theta0: Any
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
-    replaces: ClassVar[tuple[str, ...]] = ("blocks",)
+    replaces: ClassVar[tuple[str, ...]] = ("minimal",)
 
     def _check(self, *variances: str) -> None:
         """Check the settings that both have, and those named, which are nonnegative numbers."""
@@ -194,7 +187,7 @@ class ExtendedKalman(Minimal):
         }
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(structure_of("ExtendedKalman", model).n_x), "blocks": minimal_memory(model)}
+        return {**self.state(structure_of("ExtendedKalman", model).n_x), "minimal": 1.0}
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)

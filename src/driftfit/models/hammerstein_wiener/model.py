@@ -48,8 +48,8 @@ from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Implicit, Model
 from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.output_curve import play
-from driftfit.models.hammerstein_wiener.steps import DIGITS, build
-from driftfit.models.hammerstein_wiener.structure import Structure, memory, places_of
+from driftfit.models.hammerstein_wiener.steps import DIGITS, Input, build, inputs_of, memory
+from driftfit.models.hammerstein_wiener.structure import Structure
 from driftfit.models.hammerstein_wiener.thresholds import settled
 from driftfit.models.inputs import CountedInputs
 from driftfit.readings.screen import suspect
@@ -157,7 +157,7 @@ class HammersteinWiener(CountedInputs, Implicit):
                 raise ValueError(
                     f"HammersteinWiener: {type(basis).__name__} is not one-to-one, so it can only be an input block."
                 )
-        if len({(basis.kind, basis.n, basis.parameters.size) for basis in self.outs}) > 1:
+        if len({(basis.functions, basis.n, basis.parameters.size) for basis in self.outs}) > 1:
             raise ValueError(
                 f"HammersteinWiener: outputs that run together have bases of one kind and size; got {self.output!r}. "
                 "Use a separate model for any other output."
@@ -235,16 +235,16 @@ class HammersteinWiener(CountedInputs, Implicit):
 
     def memory(self) -> Mapping[str, Any]:
         sigma = self.output_noise[0] if several(self.output_noise) else self.output_noise
-        return {"blocks": memory(self.structure, self.delays, self.bases, self.out, sigma or 0.0, self._least_noise)}
+        return memory(self.structure, self.delays, self.bases, self.out, sigma or 0.0, self._least_noise)
 
     @cached_property
-    def places(self) -> tuple[int, ...]:
-        """The positions of all numbers in the memory of the steps."""
-        return places_of(self.structure, self.delays, self.bases, self.out)
+    def entering(self) -> tuple[Input, ...]:
+        """The inputs, and where their numbers are in the state."""
+        return inputs_of(self.structure, self.delays, self.bases)
 
     @property
     def steps(self) -> ModelSteps:
-        return build(tuple(basis.kind for basis in self.bases), self.out.kind, self.places)
+        return build(self.structure, self.entering, self.out.functions, not self.linear)
 
     @property
     def reach(self) -> int:
@@ -281,8 +281,7 @@ class HammersteinWiener(CountedInputs, Implicit):
 
     def slope(self, theta: Array, y: Array) -> Array:
         """F'(y; d), the slope of the inverse of the output block; theta (..., n) or xi (..., n_x), y (...)."""
-        found: Array = np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1)
-        return found
+        return np.asarray(np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1))
 
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of w to one equation error: that of 1 / A(z)."""

@@ -23,18 +23,19 @@ and `Inverse` inverts F on a grid over a given span of outputs. Cost per sample 
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, part, shared
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.hammerstein_wiener.basis import Basis
-from driftfit.models.hammerstein_wiener.curve_kernels import LEGENDRE, POWERS, legendre, powers
-from driftfit.models.hammerstein_wiener.structure import AT, GRID, NUMBER, Places
+from driftfit.models.hammerstein_wiener.curve_kernels import powers
 from driftfit.models.hammerstein_wiener.thresholds import INSIDE, Thresholds
 
+GRID = 64
+"""Points of the grid on which the output block is inverted."""
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""
 SAFE = 0.99
@@ -48,113 +49,119 @@ SPREAD = 10.0
 CELL_STEPS = 3
 """The same of `Inverse`, which begins at the chord of the cell."""
 
-Kind = tuple[Any, int]
-"""The compiled routine of a basis, and its code."""
+
+def memory(out: Basis) -> dict[str, Any]:
+    """The fields of the inverse before the first sample."""
+    none, grid = np.zeros(out.n), np.zeros((out.n, GRID))
+    return {
+        "d_now": np.eye(1, out.n)[0],  # 1, d_2 .. before the sample
+        "output_numbers": out.parameters,
+        "trial": none, "trial_slopes": none,  # the functions at a trial y, and their slopes
+        "y_lowest": np.inf, "y_highest": -np.inf,  # the range of accepted outputs
+        "y_bottom": out.limits[0], "y_top": out.limits[1], "y_scale": out.scale,
+        "grid_due": 0.0,  # whether the range changed since the grid was computed
+        "grid_low": 0.0, "grid_step": 0.0, "grid_values": grid, "grid_slopes": grid,
+        "grid_rises": 1.0, "envelope": grid[0],  # whether the levels increase; their envelope
+        "d_checked": none, "d_reach": np.full(out.n, np.inf),  # d for which they do, and the safe distance from it
+    }  # fmt: skip
 
 
 @lru_cache
-def values_of(kind: Kind, numbers: int, following: int, count: int) -> Any:
-    """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes.
+def trying(functions: Any) -> Any:
+    """A kernel that fills ``trial`` and ``trial_slopes`` with the functions of the output block at y."""
 
-    Every basis is evaluated by its compiled routine, called by symbol. Raw powers and Legendre polynomials, the most
-    common ones, are computed inline.
-    """
-    evaluate, code = kind
-    inline: Any = {POWERS: powers, LEGENDRE: legendre}.get(code)
+    @kernel
+    def try_output(s: State, y: float, l: int) -> None:
+        functions(y, s.output_numbers[:, l], s.trial[:, l], s.trial_slopes[:, l])
 
-    def called(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
-        own, L = p[numbers], m.shape[1]
-        base, size = m.ctypes.data, 8 * L
-        evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
-
-    def inlined(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
-        own = m[p[numbers] + 1 : p[following], 0]
-        inline(x, own, m[at : at + p[count], 0], m[slopes : slopes + p[count], 0])
-
-    return part(called if inline is None else inlined)
+    return try_output
 
 
 @lru_cache
-def level_of(kind: Kind) -> Any:
-    """A part (m, p, y) that returns the level of the output block at y and its slope; it may fill trial, trial_bend."""
-    fill_trial = values_of(kind, AT.out, AT.curve, AT.n_out)
+def level_of(functions: Any) -> Any:
+    """A kernel that returns the level of the output block at y and its slope; it may fill ``trial``."""
+    try_output = trying(functions)
 
-    def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:
-        d, g, h = p[AT.d_now], p[AT.trial], p[AT.trial_bend]
-        fill_trial(m, p, y, g, h)
-        value, slope = m[g, 0], m[h, 0]
-        for k in range(1, p[AT.n_out]):
-            value += m[d + k, 0] * m[g + k, 0]
-            slope += m[d + k, 0] * m[h + k, 0]
+    def at_output(s: State, y: float, l: int) -> tuple[float, float]:
+        try_output(s, y, l)
+        value, slope = s.trial[0, l], s.trial_slopes[0, l]
+        for k in range(1, s.d_now.shape[0]):
+            value += s.d_now[k, l] * s.trial[k, l]
+            slope += s.d_now[k, l] * s.trial_slopes[k, l]
         return value, slope
 
-    def horner(m: Array, p: Places, y: float) -> tuple[float, float]:
+    def horner(s: State, y: float, l: int) -> tuple[float, float]:
         value, slope = 0.0, 0.0
-        for k in range(p[AT.n_out] - 1, -1, -1):
+        for k in range(s.d_now.shape[0] - 1, -1, -1):
             slope = slope * y + value
-            value = value * y + (m[p[AT.d_now] + k, 0] if k > 0 else 1.0)
+            value = value * y + (s.d_now[k, l] if k > 0 else 1.0)
         return value * y, slope * y + value
 
-    return part(horner if kind[1] == POWERS else at_output)
+    return kernel(horner if functions is powers else at_output)
 
 
-@part
-def believe(m: Array, y: float) -> None:
+@kernel
+def accept(s: State, y: float, l: int) -> None:
     """Include an output in the range of accepted outputs."""
-    if y < m[NUMBER.lowest, 0] or y > m[NUMBER.highest, 0]:
-        m[NUMBER.lowest, 0], m[NUMBER.highest, 0] = min(m[NUMBER.lowest, 0], y), max(m[NUMBER.highest, 0], y)
-        m[NUMBER.moved, 0] = 1.0
+    if y < s.y_lowest[l] or y > s.y_highest[l]:
+        s.y_lowest[l], s.y_highest[l] = min(s.y_lowest[l], y), max(s.y_highest[l], y)
+        s.grid_due[l] = 1.0
 
 
-@part
-def level(m: Array, p: Places, at: int, i: int) -> Any:
-    """sum_k d_k times function k of the table at ``at``: the level (curve) or its slope (bend) at a grid point."""
-    d, place = p[AT.d_now], at + i
-    total = m[place, 0]
-    for k in range(1, p[AT.n_out]):
-        total += m[d + k, 0] * m[place + k * GRID, 0]
-    return total
+@kernel
+def grid_level(s: State, i: int, l: int) -> float:
+    """sum_k d_k g_k at point i of the grid."""
+    total = s.grid_values[0, i, l]
+    for k in range(1, s.d_now.shape[0]):
+        total += s.d_now[k, l] * s.grid_values[k, i, l]
+    return total  # type: ignore[no-any-return]
 
 
-@shared
-def look(m: Array, p: Places) -> None:
+@kernel
+def grid_slope(s: State, i: int, l: int) -> float:
+    """Its slope there."""
+    total = s.grid_slopes[0, i, l]
+    for k in range(1, s.d_now.shape[0]):
+        total += s.d_now[k, l] * s.grid_slopes[k, i, l]
+    return total  # type: ignore[no-any-return]
+
+
+@partial(kernel, inline=False)
+def check(s: State, l: int) -> None:
     """Check whether the levels increase, and how far d may change until the next check; if not, make the envelope."""
-    n_out, d, checked, reach, at = p[AT.n_out], p[AT.d_now], p[AT.d_checked], p[AT.reach], p[AT.curve]
-    levels = p[AT.level]
     for i in range(GRID):
-        m[levels + i, 0] = level(m, p, at, i)
+        s.envelope[i, l] = grid_level(s, i, l)
     falls = 0
     for i in range(GRID - 1):
-        falls += 0 if m[levels + i + 1, 0] > m[levels + i, 0] else 1
-    m[NUMBER.rising, 0] = 1.0 if falls == 0 else 0.0
-    m[reach, 0] = 0.0 if falls == 0 else np.inf
+        falls += 0 if s.envelope[i + 1, l] > s.envelope[i, l] else 1
+    s.grid_rises[l] = 1.0 if falls == 0 else 0.0
+    s.d_reach[0, l] = 0.0 if falls == 0 else np.inf
     if falls == 0:
-        for k in range(1, n_out):
+        for k in range(1, s.d_now.shape[0]):
             most = 0.0
             for i in range(GRID - 1):
-                place = at + k * GRID + i
-                most = max(most, abs(m[place + 1, 0] - m[place, 0]) / (m[levels + i + 1, 0] - m[levels + i, 0]))
-            m[checked + k, 0], m[reach + k, 0] = m[d + k, 0], most
+                rise = s.envelope[i + 1, l] - s.envelope[i, l]
+                most = max(most, abs(s.grid_values[k, i + 1, l] - s.grid_values[k, i, l]) / rise)
+            s.d_checked[k, l], s.d_reach[k, l] = s.d_now[k, l], most
     else:
         for i in range(GRID // 2, GRID - 1):
-            m[levels + i + 1, 0] = max(m[levels + i + 1, 0], m[levels + i, 0])
+            s.envelope[i + 1, l] = max(s.envelope[i + 1, l], s.envelope[i, l])
         for i in range(GRID // 2, 0, -1):
-            m[levels + i - 1, 0] = min(m[levels + i - 1, 0], m[levels + i, 0])
+            s.envelope[i - 1, l] = min(s.envelope[i - 1, l], s.envelope[i, l])
 
 
-@part
-def rises(m: Array, p: Places) -> bool:
+@kernel
+def rises(s: State, l: int) -> bool:
     """Whether the output block with the present d increases along the grid."""
-    d, checked, reach = p[AT.d_now], p[AT.d_checked], p[AT.reach]
-    moved = m[reach, 0]
-    for k in range(1, p[AT.n_out]):
-        moved += abs(m[d + k, 0] - m[checked + k, 0]) * m[reach + k, 0]
+    moved = s.d_reach[0, l]
+    for k in range(1, s.d_now.shape[0]):
+        moved += abs(s.d_now[k, l] - s.d_checked[k, l]) * s.d_reach[k, l]
     if not moved < SAFE:
-        look(m, p)
-    return bool(m[NUMBER.rising, 0] > 0.0)
+        check(s, l)
+    return bool(s.grid_rises[l] > 0.0)
 
 
-@part
+@kernel
 def cubic(share: float, mean: float, first: float, last: float) -> float:
     """Where in a cell, 0 to 1, a share of its rise is reached, from the mean slope and those at both ends."""
     one = min(mean / first, 3.0) if first > 0.0 else 3.0
@@ -163,102 +170,80 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
     return share * (share * (3.0 - 2.0 * share) + rest * (rest * one - share * other))
 
 
-@part
-def locate(m: Array, p: Places, right: float) -> Any:
-    """The level if its cell of the grid was found, which is marked as ``late``; otherwise y: NaN without a grid, or the
-    one at which the envelope has that level, within the grid.
-    """
-    m[NUMBER.late, 0] = 0.0
-    if not m[NUMBER.step, 0] > 0.0 or right != right:
-        return np.nan
-    rising, levels = rises(m, p), p[AT.level]
-    below, above = 0, GRID - 1
-    while above - below > 1:
-        middle = (below + above) // 2
-        here = level(m, p, p[AT.curve], middle) if rising else m[levels + middle, 0]
-        under = here <= right
-        below = middle if under else below
-        above = above if under else middle
-    if rising:
-        m[NUMBER.cell, 0], m[NUMBER.late, 0] = below, 1.0
-        return min(max(right, -LARGEST), LARGEST)
-    before, after = m[levels + below, 0], m[levels + below + 1, 0]
-    share = 1.0 if right >= after else (right - before) / (after - before) if right > before else 0.0
-    return m[NUMBER.low, 0] + m[NUMBER.step, 0] * (below + share)
-
-
 @lru_cache
-def refining(out: Kind) -> Any:
-    """A part (m, p, right) that solves in the cell that was found."""
-    level_at = level_of(out)
+def inverting(functions: Any) -> Any:
+    """A kernel that returns the y at which the output block has a level: NaN without a grid, within the grid if the
+    levels do not increase or the level is beyond them.
+    """
+    level_at = level_of(functions)
 
-    def refine(m: Array, p: Places, right: float) -> Any:
-        step, start, below = m[NUMBER.step, 0], m[NUMBER.low, 0], int(m[NUMBER.cell, 0])
-        at, bends = p[AT.curve], p[AT.bend]
-        before, after = level(m, p, at, below), level(m, p, at, below + 1)
+    @kernel
+    def solve(s: State, right: float, below: int, l: int) -> float:
+        """In a cell of the grid."""
+        step, start = s.grid_step[l], s.grid_low[l]
+        before, after = grid_level(s, below, l), grid_level(s, below + 1, l)
         if right < before:
-            return start
+            return start  # type: ignore[no-any-return]
         if right >= after:
-            return start + (GRID - 1) * step
-        first, final, rise = level(m, p, bends, below), level(m, p, bends, below + 1), after - before
+            return start + (GRID - 1) * step  # type: ignore[no-any-return]
+        first, final, rise = grid_slope(s, below, l), grid_slope(s, below + 1, l), after - before
         mean, left = rise / step, start + below * step
         y = left + step * cubic((right - before) / rise, mean, first, final)
         bend = abs(first - mean) + abs(final - mean)
         for _ in range(NEWTON_STEPS):
-            value, slope = level_at(m, p, y)
+            value, slope = level_at(s, y, l)
             if not slope > 0.0:
                 break
             change = (right - value) / slope
             y = min(max(y + change, left), left + step)
             if change * change * bend <= FINE * step * step * slope:
                 break
-        return y
+        return y  # type: ignore[no-any-return]
 
-    return part(refine)
+    @partial(kernel, inline=False)
+    def invert(s: State, right: float, l: int) -> float:
+        if not s.grid_step[l] > 0.0 or right != right:
+            return np.nan
+        rising = rises(s, l)
+        below, above = 0, GRID - 1
+        while above - below > 1:
+            middle = (below + above) // 2
+            here = grid_level(s, middle, l) if rising else s.envelope[middle, l]
+            under = here <= right
+            below = middle if under else below
+            above = above if under else middle
+        if rising:
+            return solve(s, min(max(right, -LARGEST), LARGEST), below, l)  # type: ignore[no-any-return]
+        before, after = s.envelope[below, l], s.envelope[below + 1, l]
+        share = 1.0 if right >= after else (right - before) / (after - before) if right > before else 0.0
+        return s.grid_low[l] + s.grid_step[l] * (below + share)  # type: ignore[no-any-return]
+
+    return invert
 
 
 @lru_cache
-def inverting(out: Kind) -> Any:
-    """A core (m, p, right) that inverts the output block, where it is seldom needed."""
-    refine = refining(out)
+def laying(functions: Any) -> Any:
+    """A kernel that computes the grid again if the accepted outputs need another."""
+    try_output = trying(functions)
 
-    def invert(m: Array, p: Places, right: float) -> Any:
-        found = locate(m, p, right)
-        return refine(m, p, found) if m[NUMBER.late, 0] > 0.0 else found
-
-    return shared(invert)
-
-
-@lru_cache
-def laying(out: Kind) -> Any:
-    """A core (m, p) that computes the grid again if the accepted outputs need another."""
-    values = values_of(out, AT.out, AT.curve, AT.n_out)
-
-    def lay(m: Array, p: Places) -> None:
-        m[NUMBER.moved, 0] = 0.0
-        low, high, scale = m[NUMBER.lowest, 0], m[NUMBER.highest, 0], m[NUMBER.scale, 0]
-        bottom, top = m[NUMBER.bottom, 0], m[NUMBER.top, 0]
-        start, end = m[NUMBER.low, 0], m[NUMBER.low, 0] + (GRID - 1) * m[NUMBER.step, 0]
+    def lay(s: State, l: int) -> None:
+        s.grid_due[l] = 0.0
+        low, high, scale, bottom, top = s.y_lowest[l], s.y_highest[l], s.y_scale[l], s.y_bottom[l], s.y_top[l]
+        start, end = s.grid_low[l], s.grid_low[l] + (GRID - 1) * s.grid_step[l]
         wide = high - low
         alone = scale if scale > 0.0 else WIDER * (abs(high) if high != 0.0 else 1.0)
         margin = WIDER * wide if wide > 0.0 else alone
         short = (low < start and start > bottom) or (high > end and end < top)
-        if low <= high and (m[NUMBER.step, 0] == 0.0 or short or end - start > SPREAD * (wide + 2.0 * margin)):
+        if low <= high and (s.grid_step[l] == 0.0 or short or end - start > SPREAD * (wide + 2.0 * margin)):
             start, end = max(low - margin, bottom), min(high + margin, top)
-            m[NUMBER.low, 0], m[NUMBER.step, 0] = start, (end - start) / (GRID - 1)
-            table(m, p, end)
-            m[p[AT.reach], 0] = np.inf
+            s.grid_low[l], s.grid_step[l] = start, (end - start) / (GRID - 1)
+            for i in range(GRID):
+                try_output(s, min(s.grid_low[l] + i * s.grid_step[l], end), l)
+                for k in range(s.d_now.shape[0]):
+                    s.grid_values[k, i, l], s.grid_slopes[k, i, l] = s.trial[k, l], s.trial_slopes[k, l]
+            s.d_reach[0, l] = np.inf
 
-    def fill_table(m: Array, p: Places, end: float) -> None:
-        n_out, g, h = p[AT.n_out], p[AT.trial], p[AT.trial_bend]
-        for i in range(GRID):
-            values(m, p, min(m[NUMBER.low, 0] + i * m[NUMBER.step, 0], end), g, h)
-            for k in range(n_out):
-                m[p[AT.curve] + k * GRID + i, 0] = m[g + k, 0]
-                m[p[AT.bend] + k * GRID + i, 0] = m[h + k, 0]
-
-    table = part(fill_table)
-    return shared(lay)
+    return kernel(lay, short=True)
 
 
 def play(model: Any, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:

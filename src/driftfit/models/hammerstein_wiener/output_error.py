@@ -29,13 +29,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing, part, shared
+from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, minimal_memory, structure_of
+from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, structure_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.output_curve import Kind, inverting, level, rises, values_of
-from driftfit.models.hammerstein_wiener.structure import AT, GRID, INPUT, NUMBER, Places, room
+from driftfit.models.hammerstein_wiener.output_curve import GRID, grid_level, inverting, rises, trying
+from driftfit.models.hammerstein_wiener.steps import Input, driven
+from driftfit.models.hammerstein_wiener.structure import Structure
 from driftfit.trackers.forms.covariance import LEFT
 
 SLOPE_SHARE = 0.05
@@ -53,235 +54,214 @@ that a fault code cannot become the scale.
 """
 
 
-@shared
-def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
+@kernel
+def past_levels(s: State, na: int, l: int) -> None:
     """w = F(y) at the last outputs, each of variance p_w and independent of xi."""
-    n_out, d, g = p[AT.n_out], p[AT.d_now], p[AT.g_past]
-    for i in range(p[AT.na]):
-        total = m[g + (i + 1) * n_out, 0]
-        for k in range(1, n_out):
-            total += m[d + k, 0] * m[g + (i + 1) * n_out + k, 0]
-        w[i] = total if total == total else 0.0
-        for x in range(i, len(S)):
-            S[x, i] = 0.0
-        S[i, i] = p_w
+    for i in range(na):
+        total = s.output_lags[i + 1, 0, l]
+        for k in range(1, s.d_now.shape[0]):
+            total += s.d_now[k, l] * s.output_lags[i + 1, k, l]
+        s.w[i, l] = total if total == total else 0.0
+        for x in range(i, s.S.shape[0]):
+            s.S[x, i, l] = 0.0
+        s.S[i, i, l] = s.p_w[l]
 
 
-@part
-def product(S: Array, row: Array, moved: Array, total: float) -> float:
-    """moved = S row from the lower triangle; returns row' S row, added to a total."""
-    N = len(S)
+@kernel
+def product(s: State, total: float, l: int) -> float:
+    """``moved`` = S row from the lower triangle; returns row' S row, added to a total."""
+    N = s.S.shape[0]
     for x in range(N):
         value = 0.0
         for z in range(x + 1):
-            value += S[x, z] * row[z]
+            value += s.S[x, z, l] * s.row[z, l]
         for z in range(x + 1, N):
-            value += S[z, x] * row[z]
-        moved[x] = value
-        total += row[x] * value
+            value += s.S[z, x, l] * s.row[z, l]
+        s.moved[x, l] = value
+        total += s.row[x, l] * value
     return total
 
 
-@part
-def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> float:
-    """The row of the transition for the present w but for the intercept; returns w."""
-    n_w, total = len(w), 0.0
-    for x in range(len(row)):
-        row[x] = 0.0
-    for i in range(p[AT.na]):
-        row[i] = -theta[i]
-        row[n_w + i] = -w[i]
-        total -= theta[i] * w[i]
-    for i in range(p[AT.inputs]):
-        own = AT.count + INPUT.count * i
-        nb, b, c, bc = p[own + INPUT.nb], p[own + INPUT.b], p[own + INPUT.c], p[own + INPUT.bc]
-        for j in range(nb):
-            v = -phi[b + j]
-            for k in range(p[own + INPUT.n_in] - 1):
-                f = -phi[bc + k * nb + j]
-                v += theta[c + k] * f
-                row[n_w + c + k] += theta[b + j] * f
-            row[n_w + b + j] = v
-            total += theta[b + j] * v
-    return total
+@lru_cache
+def _transition(structure: Structure, inputs: tuple[Input, ...]) -> Any:
+    """A kernel that fills the row of the transition for the present w; returns w."""
+    lags, na, at_l = driven(inputs), structure.na, structure.n_x - structure.intercept
+    count, n_x = len(lags), structure.n_x
+
+    @kernel
+    def transition(s: State, l: int) -> float:
+        n_w, total = s.w.shape[0], 0.0
+        for x in range(s.row.shape[0]):
+            s.row[x, l] = 0.0
+        for i in range(na):
+            s.row[i, l] = -s.theta[i, l]
+            s.row[n_w + i, l] = -s.w[i, l]
+            total -= s.theta[i, l] * s.w[i, l]
+        for r in range(count):
+            b, bc, apart, c = lags[r, 0], lags[r, 1], lags[r, 2], lags[r, 3]
+            v = -s.phi[b, l]
+            for k in range(lags[r, 4]):
+                f = -s.phi[bc + k * apart, l]
+                v += s.theta[c + k, l] * f
+                s.row[n_w + c + k, l] += s.theta[b, l] * f
+            s.row[n_w + b, l] = v
+            total += s.theta[b, l] * v
+        for x in range(at_l, n_x):
+            s.row[n_w + x, l] = -1.0
+            total -= s.theta[x, l]
+        return total
+
+    return transition
 
 
-@shared
-def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, scratch: Array, q_w: float, reach: float) -> None:
+@kernel
+def advance(s: State, w: float, q_w: float, reach: float, l: int) -> None:
     """The time update of w, which is held within reach whatever the poles do, and of S."""
-    n_w, N, row, moved = len(w), len(S), scratch[0], scratch[1]
-    total = transition(p, theta, phi, w, row)
-    for x in range(n_w + p[AT.x_d] + p[AT.n_out] - 1, N):
-        row[x] = -1.0
-        total -= theta[x - n_w]
-    own = product(S, row, moved, q_w)
+    n_w, N = s.w.shape[0], s.S.shape[0]
+    own = product(s, q_w, l)
     for i in range(n_w - 1, 0, -1):
-        w[i] = w[i - 1]
+        s.w[i, l] = s.w[i - 1, l]
         for j in range(i, 0, -1):
-            S[i, j] = S[i - 1, j - 1]
+            s.S[i, j, l] = s.S[i - 1, j - 1, l]
         for x in range(n_w, N):
-            S[x, i] = S[x, i - 1]
+            s.S[x, i, l] = s.S[x, i - 1, l]
     most = OUTAGE_STD * OUTAGE_STD * reach * reach
     shrink = np.sqrt(most / own) if own > most else 1.0
     for x in range(1, N):
-        S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
-    S[0, 0] = min(own, most)
-    w[0] = min(max(total, -reach), reach)
+        s.S[x, 0, l] = shrink * (s.moved[x - 1, l] if x < n_w else s.moved[x, l])
+    s.S[0, 0, l] = min(own, most)
+    s.w[0, l] = min(max(w, -reach), reach)
 
 
-@shared
-def absorb(e: float, s: float, theta: Array, w: Array, S: Array, moved: Array) -> None:
+@kernel
+def absorb(s: State, l: int) -> None:
     """The measurement update for an innovation e of variance s, with ``moved`` = S h of the forecast."""
-    n_w = len(w)
-    for x in range(len(S)):
-        k = moved[x] / s
+    n_w = s.w.shape[0]
+    for x in range(s.S.shape[0]):
+        k = s.moved[x, l] / s.s[l]
         if x < n_w:
-            w[x] += k * e
+            s.w[x, l] += k * s.e[l]
         else:
-            theta[x - n_w] += k * e
+            s.theta[x - n_w, l] += k * s.e[l]
         for z in range(x):
-            S[x, z] -= k * moved[z]
-        S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
+            s.S[x, z, l] -= k * s.moved[z, l]
+        s.S[x, x, l] = max(s.S[x, x, l] - k * s.moved[x, l], LEFT * s.S[x, x, l])
 
 
-@shared
-def unknown_power(m: Array, p: Places, theta: Array, v_power: Array) -> float:
-    """The variance that missing inputs leave in w, sum b_j^2 times the usual power of v; 0 where all are there."""
-    total = 0.0
-    for i in range(p[AT.inputs]):
-        at = AT.count + INPUT.count * i
-        n_in, b = p[at + INPUT.n_in], p[at + INPUT.b]
-        f = p[at + INPUT.f] + p[at + INPUT.nk] * n_in
-        for j in range(p[at + INPUT.nb]):
-            missing = 0
-            for k in range(n_in):
-                missing += 0 if abs(m[f + j * n_in + k, 0]) < LARGEST else 1
-            total += max(theta[b + j] * theta[b + j] * v_power[i], TINY) if missing > 0 else 0.0
-    return total
+@lru_cache
+def _power(inputs: tuple[Input, ...]) -> tuple[Any, Any]:
+    """Two kernels for the usual power of v: the variance that missing inputs leave in w, sum b_j^2 times that power, 0
+    where all are there; and the update of the power.
+    """
+    lags, newest = driven(inputs), np.array([(one.lags, one.c, one.n_in - 1) for one in inputs])
+    count, m = len(lags), len(inputs)
+
+    @kernel
+    def unknown_power(s: State, l: int) -> float:
+        total = 0.0
+        for r in range(count):
+            missing, b = 0, lags[r, 0]
+            for k in range(lags[r, 4] + 1):
+                missing += 0 if abs(s.input_lags[lags[r, 5] + k, l]) < LARGEST else 1
+            power = s.theta[b, l] * s.theta[b, l] * s.v_power[lags[r, 6], l]
+            total += max(power, TINY) if missing > 0 else 0.0
+        return total
+
+    @kernel
+    def follow_power(s: State, l: int) -> None:
+        for i in range(m):
+            f, c = newest[i, 0], newest[i, 1]
+            v = s.input_lags[f, l]
+            for k in range(newest[i, 2]):
+                v += s.theta[c + k, l] * s.input_lags[f + 1 + k, l]
+            if abs(v) < LARGEST:
+                moved = POWER_WEIGHT * (min(v * v, POWER_LIMIT * s.v_power[i, l]) - s.v_power[i, l])
+                s.v_power[i, l] += moved if s.v_power[i, l] > 0.0 else v * v
+
+    return unknown_power, follow_power
 
 
-@shared
-def follow_power(m: Array, p: Places, theta: Array, v_power: Array) -> None:
-    """Update the usual power of v, which is used for missing inputs."""
-    for i in range(p[AT.inputs]):
-        at = AT.count + INPUT.count * i
-        f, v = p[at + INPUT.f], m[p[at + INPUT.f], 0]
-        for k in range(p[at + INPUT.n_in] - 1):
-            v += theta[p[at + INPUT.c] + k] * m[f + 1 + k, 0]
-        if abs(v) < LARGEST:
-            moved = POWER_WEIGHT * (min(v * v, POWER_LIMIT * v_power[i]) - v_power[i])
-            v_power[i] += moved if v_power[i] > 0.0 else v * v
-
-
-@shared
-def reach_of(m: Array, p: Places) -> float:
+@kernel
+def reach_of(s: State, curved: bool, l: int) -> float:
     """The largest |w| that the outputs observed so far allow."""
-    low, high = m[NUMBER.lowest, 0], m[NUMBER.highest, 0]
-    if p[AT.identity] == 0:
-        rising, last = rises(m, p), GRID - 1
-        low = level(m, p, p[AT.curve], 0) if rising else m[p[AT.level], 0]
-        high = level(m, p, p[AT.curve], last) if rising else m[p[AT.level] + last, 0]
+    low, high = s.y_lowest[l], s.y_highest[l]
+    if curved:
+        rising, last = rises(s, l), GRID - 1
+        low = grid_level(s, 0, l) if rising else s.envelope[0, l]
+        high = grid_level(s, last, l) if rising else s.envelope[last, l]
     reach = W_RANGE * max(abs(low), abs(high))
     return reach if reach > 0.0 and reach < LARGEST else LARGEST
 
 
 @lru_cache
-def _following(p: tuple[int, ...]) -> Step:
-    """`follow_power` of a state."""
-    orders, rows = np.array(p), room(p)
+def _steps(structure: Structure, inputs: tuple[Input, ...], out: Any, curved: bool) -> TrackerSteps:
+    """The steps for the orders of a model and the functions of its output."""
+    na, n_x, more = structure.na, structure.n_x, structure.n_out - 1
+    n_w, at_d = max(na, 1), n_x - structure.intercept - more
+    transition, (unknown_power, follow_power) = _transition(structure, inputs), _power(inputs)
+    try_output, invert = trying(out), inverting(out)
 
     @kernel
-    def follow(s: State, l: int) -> None:
-        n, m = s.theta.shape[0], s.v_power.shape[0]
-        theta, v_power = floats(s.theta.ctypes.data, 1, n)[0], floats(s.v_power.ctypes.data, 1, m)[0]
-        follow_power(floats(s.blocks.ctypes.data, rows, 1), orders, theta, v_power)
-
-    return follow  # type: ignore[no-any-return]
-
-
-@kernel
-def advance_states(s: State, p: Places, m: Array, S: Array, scratch: Array, l: int) -> float:
-    """The time update of xi and w; returns the variance that missing inputs leave in w."""
-    n_w, n_x, d = max(p[AT.na], 1), s.theta.shape[0], p[AT.d_now]
-    theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
-    phi, v_power = floats(s.phi.ctypes.data, 1, p[AT.n])[0], floats(s.v_power.ctypes.data, 1, p[AT.inputs])[0]
-    for i in range(n_x):
-        for j in range(i + 1):
-            S[n_w + i, n_w + j] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
-    for k in range(p[AT.n_out] - 1):
-        m[d + k + 1, 0] = theta[p[AT.x_d] + k]
-    if s.begun[l] == 0.0 and m[NUMBER.started, 0] > 0.0:
-        past_levels(m, p, w, S, s.p_w[l])
-        s.begun[l] = 1.0
-    power = unknown_power(m, p, theta, v_power)
-    advance(p, theta, phi, w, S, scratch, s.q_w[l] + power, reach_of(m, p))
-    return power  # type: ignore[no-any-return]
-
-
-@lru_cache
-def _steps(out: Kind, p: tuple[int, ...], intercept: bool) -> TrackerSteps:
-    """The steps for the functions of an output basis and the places of a model."""
-    orders, rows, n_w, curved = np.array(p), room(p), max(p[AT.na], 1), not p[AT.identity]
-    n_out, d, free, g, h = p[AT.n_out], p[AT.d_now], p[AT.x_d], p[AT.trial], p[AT.trial_bend]
-    n_x = free + n_out - 1 + intercept
-    N, follow = n_w + n_x, _following(p)
-    fill_trial, invert = values_of(out, AT.out, AT.curve, AT.n_out), inverting(out)
+    def predict(s: State, l: int) -> None:
+        """The time update of xi and w, and the variance that missing inputs leave in w."""
+        for i in range(n_x):
+            for j in range(i + 1):
+                s.S[n_w + i, n_w + j, l] += s.q[i, j, l] * (s.dt[l] * s.drift[l])
+        for k in range(more):
+            s.d_now[k + 1, l] = s.theta[at_d + k, l]
+        if s.begun[l] == 0.0 and s.started[l] > 0.0:
+            past_levels(s, na, l)
+            s.begun[l] = 1.0
+        s.unknown[l] = unknown_power(s, l)
+        advance(s, transition(s, l), s.q_w[l] + s.unknown[l], reach_of(s, curved, l), l)
 
     @kernel
     def forecast(s: State, l: int) -> None:
-        m, S, scratch = (
-            floats(s.blocks.ctypes.data, rows, 1),
-            floats(s.S.ctypes.data, N, N),
-            floats(s.scratch.ctypes.data, 2, N),
-        )
-        power = advance_states(s, orders, m, S, scratch, l)
-        y_hat, y = s.w[0, l], m[NUMBER.raw, 0]
+        y_hat, y = s.w[0, l], s.y_given[l]
         if curved:
-            y_hat = invert(m, orders, y_hat)
+            y_hat = invert(s, y_hat, l)
         able = abs(y_hat) < np.inf
-        fill_trial(m, orders, y_hat if able else 0.0, g, h)
+        try_output(s, y_hat if able else 0.0, l)
         slope = 0.0
-        for k in range(n_out):
-            slope += m[d + k, 0] * m[h + k, 0]
-        slope, given = max(slope, s.least_slope[l]), m[NUMBER.given, 0]
-        valid, observed = power == 0.0 and able and s.begun[l] > 0.0, abs(y) < np.inf
+        for k in range(more + 1):
+            slope += s.d_now[k, l] * s.trial_slopes[k, l]
+        slope, given = max(slope, s.least_slope[l]), s.given_noise[l]
+        valid, observed = s.unknown[l] == 0.0 and able and s.begun[l] > 0.0, abs(y) < np.inf
         used = valid and observed and given < np.inf
         s.valid[l], s.observed[l] = 1.0 if valid else 0.0, 1.0 if observed else 0.0
         s.ok[l], s.e[l] = 1.0 if used else 0.0, y - y_hat if used else 0.0
-        for x in range(N):
-            scratch[0, x] = 0.0
-        scratch[0, 0] = 1.0 / slope
-        for k in range(1, n_out):
-            scratch[0, n_w + free + k - 1] = -m[g + k, 0] / slope
-        s.h[l] = product(S, scratch[0], scratch[1], 0.0)
-        m[NUMBER.predicted, 0], m[NUMBER.late, 0], s.y_hat[l] = y_hat, 0.0, y_hat
+        for x in range(s.row.shape[0]):
+            s.row[x, l] = 0.0
+        s.row[0, l] = 1.0 / slope
+        for k in range(more):
+            s.row[n_w + at_d + k, l] = -s.trial[k + 1, l] / slope
+        s.h[l] = product(s, 0.0, l)
+        s.predicted[l], s.y_hat[l] = y_hat, y_hat
         s.noise[l] = given if given < np.inf else 1.0
 
     @kernel
     def correct(s: State, l: int) -> None:
-        theta, w = floats(s.theta.ctypes.data, 1, n_x)[0], floats(s.w.ctypes.data, 1, n_w)[0]
-        S, scratch = floats(s.S.ctypes.data, N, N), floats(s.scratch.ctypes.data, 2, N)
         if s.ok[l] > 0.0:
-            absorb(s.e[l], s.s[l], theta, w, S, scratch[1])
-        follow(s, l)
+            absorb(s, l)
+        follow_power(s, l)
         for i in range(n_x):
             for j in range(i + 1):
-                s.P[i, j, l] = S[n_w + i, n_w + j]
+                s.P[i, j, l] = s.S[n_w + i, n_w + j, l]
 
-    return TrackerSteps(nothing, forecast, correct)
+    return TrackerSteps(predict, forecast, correct, reads_model=True)
 
 
 @lru_cache
-def _applying(place: Step, p: tuple[int, ...]) -> Step:
+def _applying(apply: Step, inputs: tuple[Input, ...]) -> Step:
     """The input also updates the usual power of v."""
-    follow = _following(p)
+    _, follow_power = _power(inputs)
 
     @kernel
-    def apply(s: State, l: int) -> None:
-        place(s, l)
-        follow(s, l)
+    def apply_and_follow(s: State, l: int) -> None:
+        apply(s, l)
+        follow_power(s, l)
 
-    return apply  # type: ignore[no-any-return]
+    return apply_and_follow  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -336,22 +316,21 @@ class OutputError(Minimal):
         S = np.zeros((N, N))
         S[n_w:, n_w:] = state["P"]
         return {
-            **state, "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
-            "scratch": np.zeros((2, N)), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0,
+            **state, "minimal": 1.0, "w": np.zeros(n_w), "S": S, "row": np.zeros(N), "moved": np.zeros(N),
+            "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0, "unknown": 0.0,
             "least_slope": SLOPE_SHARE * model.out.steepness, "v_power": np.zeros(model.m),
         }  # fmt: skip
 
     def steps_for(self, model: Model) -> TrackerSteps:
-        structure_of("OutputError", model)
+        structure = structure_of("OutputError", model)
         if len(model.outputs) > 1:
             raise ValueError("OutputError: follows one output at a time; track each output by itself.")
         assert isinstance(model, HammersteinWiener)
-        return _steps(model.out.kind, model.places, model.intercept)._replace(machines=(model.out.evaluate,))
+        return _steps(structure, model.entering, model.out.functions, not model.linear)
 
     def apply_for(self, model: Model) -> Step | None:
         assert isinstance(model, HammersteinWiener)
-        late = model.steps.apply
-        return None if late is None else _applying(late, model.places)
+        return model.steps.apply and _applying(model.steps.apply, model.entering)
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         n_w = len(lane["w"])

@@ -1,4 +1,4 @@
-"""The positions of the parameters of a Hammerstein-Wiener model in its regression, and of numbers in its memory.
+"""The positions of the parameters of a Hammerstein-Wiener model in its regression.
 
     theta = [a_1 .. a_na, b_1 .. b_nb, d_2 .. d_q, b_1 c_2 .. b_nb c_2, b_1 c_3 .., a_1 d_2 .. a_na d_2, .., (l)]
     xi    = [a_1 .. a_na, b_1 .. b_nb, c_2 .. c_p, d_2 .. d_q, (l)]
@@ -7,28 +7,10 @@
 with c_1 = d_1 = 1, p = n_in and q = n_out functions in the input and in the output block, and l the intercept. The lag
 is the fastest index. With several inputs each has its own nb and n_in, and b, c and the products b c are those of the
 first input, then those of the second, and so on. theta has n entries, xi the n_x free ones.
-
-The memory of the compiled steps is one field ``blocks`` (size, L) of numbers and arrays one after the other. Their
-routines are given the address of ``blocks`` for one lane, in which element i is stored L numbers after element i - 1.
-The positions, `places_of`, are constants of these routines, so that their loops can be unrolled.
-
-    now, next (n)             regressors of this sample except those of its output, and of the next
-    f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, .., of a dead zone with the thresholds known then;
-                              one array after the other where there are several inputs
-    g_past  (1 + na, n_out)   functions of the outputs t, t - 1, ..; their slopes in h_past
-    d_now   (n_out)           coefficients (1, d_2 ..) before the sample
-    trial, trial_bend         functions and slopes at a trial y; spare, slopes that are not used
-    into, out                 the numbers of the bases, those of all inputs first
-    curve (n_out, GRID)       functions of the output block on the grid; bend, their slopes
-    level (GRID)              an envelope of the levels
-    d_checked, reach (n_out)  coefficients for which the grid increases, and the safe distance from them
-    us (inputs)               the inputs of this sample
 """
 
 from __future__ import annotations
 
-from collections import namedtuple
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -36,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.models.hammerstein_wiener.basis import Basis, Polynomial
 
 
 class Spans(NamedTuple):
@@ -177,81 +158,3 @@ def positions(s: Structure, free: bool) -> tuple[Array, Array]:
         row += len(b) * len(c[free:])
     pairs += [(at_ad + k * s.na + i, i, x) for k, x in enumerate(d) for i in a]
     return np.array(alone, np.int64).reshape(-1, 2).T, np.array(pairs, np.int64).reshape(-1, 3).T
-
-
-GRID = 64
-"""Points of the grid on which the output block is inverted."""
-_Numbers = namedtuple(
-    "_Numbers",
-    "low step lowest highest bottom top rising predicted started minimal given raw variance moved late cell y dt "
-    "believed ok factor floor scale count",
-)
-NUMBER = _Numbers(*range(24))
-"""Numbers in the memory: the grid, the range of accepted outputs, where the output block is defined, whether its levels
-increase, the prediction, whether all lags are known, whether theta is xi, the given noise factor, the output as given,
-sigma^2 or 0, whether the range changed, whether a level is stored in place of the prediction, its cell of the grid,
-what steps and compiled routine exchange, whether the output becomes a lag, whether the sample was used, the noise
-factor of the equation, the least variance that sigma adds to it, and the scale of y that the basis gives.
-"""
-_Places = namedtuple(
-    "_Places",
-    "na nb n_out n nk identity adaptive d x_d ad now next f_past g_past h_past spare d_now trial trial_bend into out "
-    "curve bend level d_checked reach us inputs count",
-)
-AT = _Places(*range(29))
-"""Places: orders (nb of all inputs, nk the smallest), whether the output block is the identity and an input basis
-depends on its own coefficients, where d begins in theta and in xi and the products a d in theta, where the arrays
-begin, and how many inputs there are.
-"""
-_Inputs = namedtuple("_Inputs", "nb n_in nk f into end adaptive b c bc count")
-INPUT = _Inputs(*range(11))
-"""Places of each input, INPUT.count numbers from AT.count on: its orders, where its functions and the numbers of its
-basis begin, where those end, whether the basis depends on its own coefficients, and where its b, its c in xi, and its
-products begin.
-"""
-
-Places = Array
-"""Whole numbers (28 + 10 per input,), a constant for the compiler."""
-
-
-def room(p: Places | tuple[int, ...]) -> int:
-    """Length of the memory of these places: the inputs are its last numbers."""
-    return int(p[AT.us] + p[AT.inputs])
-
-
-def _arrays(s: Structure, delays: Sequence[int], bases: Sequence[Basis], out: Basis) -> list[Array]:
-    """The arrays before the first sample, in the order of AT."""
-    lags = sum(width * (count + delay) for width, count, delay in zip(s.n_in, s.nb, delays, strict=True))
-    outputs, grid, none = np.full((1 + max(s.na, 1)) * s.n_out, np.nan), np.zeros(GRID * s.n_out), np.zeros(s.n_out)
-    return [
-        np.full(s.n, np.nan), np.full(s.n, np.nan), np.full(lags, np.nan), outputs, outputs, np.zeros(max(s.n_in)),
-        np.eye(1, s.n_out)[0], none, none, np.concatenate([basis.parameters for basis in bases]), out.parameters,
-        grid, grid, np.zeros(GRID), none, np.full(s.n_out, np.inf), np.zeros(len(bases)),
-    ]  # fmt: skip
-
-
-def places_of(s: Structure, delays: Sequence[int], bases: Sequence[Basis], out: Basis) -> tuple[int, ...]:
-    """The places of a model with these orders, delays, and functions of its inputs and of its output."""
-    begins = np.cumsum([NUMBER.count, *(array.size for array in _arrays(s, delays, bases, out))])[:-1].tolist()
-    adaptive = [int(basis.adaptive) for basis in bases]
-    d, bc, ad = s.starts
-    head = (s.na, sum(s.nb), s.n_out, s.n, min(delays), int(out == Polynomial(1)), max(adaptive))
-    places = [*head, d, d + sum(s.n_in) - len(s.n_in), ad, *begins, len(bases)]
-    f, into, b, c = places[AT.f_past], places[AT.into], s.na, d
-    for i, basis in enumerate(bases):
-        end = into + basis.parameters.size
-        places += [s.nb[i], s.n_in[i], delays[i], f, into, end, adaptive[i], b, c, bc]
-        f, into, b, c = f + s.n_in[i] * (s.nb[i] + delays[i]), end, b + s.nb[i], c + s.n_in[i] - 1
-        bc += s.nb[i] * (s.n_in[i] - 1)
-    return tuple(places)
-
-
-def memory(
-    s: Structure, delays: Sequence[int], bases: Sequence[Basis], out: Basis, sigma: float, floor: float
-) -> Array:
-    """``blocks`` before the first sample, for measurement noise of standard deviation sigma."""
-    head = np.zeros(NUMBER.count)
-    head[[NUMBER.lowest, NUMBER.highest, NUMBER.bottom, NUMBER.top]] = np.inf, -np.inf, *out.limits
-    head[[NUMBER.rising, NUMBER.predicted]] = 1.0, np.nan
-    head[[NUMBER.variance, NUMBER.floor, NUMBER.scale]] = sigma * sigma, floor, out.scale
-    return np.concatenate([head, *_arrays(s, delays, bases, out)])

@@ -52,7 +52,7 @@ class Thresholds(Basis):
         return 3
 
     @property
-    def own_numbers(self) -> Array:
+    def parameters(self) -> Array:
         return np.array([self.start, -self.start, self.u_max, float(self.fed == "average")])
 
     @property
@@ -96,7 +96,7 @@ class DeadZone(Thresholds):
     start: Any = 0.01
     limit: float | None = None
 
-    code: ClassVar[int] = curve_kernels.DEAD_ZONE
+    functions: ClassVar[Any] = staticmethod(curve_kernels.dead_zone)
     begins: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
@@ -105,8 +105,8 @@ class DeadZone(Thresholds):
             self._set("limit", numbers("DeadZone", "limit", self.limit, ndim=0, low=0.0, strict=True))
 
     @property
-    def own_numbers(self) -> Array:
-        return np.append(super().own_numbers, self.reach)
+    def parameters(self) -> Array:
+        return np.append(super().parameters, self.reach)
 
     @property
     def reach(self) -> float:
@@ -130,7 +130,7 @@ class Saturation(Thresholds):
     input reaches converges to about the largest input.
     """
 
-    code: ClassVar[int] = curve_kernels.SATURATION
+    functions: ClassVar[Any] = staticmethod(curve_kernels.saturation)
     begins: ClassVar[float] = 0.5
 
     @property
@@ -169,7 +169,7 @@ def settled(
                 unseen = not phi[:, b : b + nb].any()  # no input is where its gain can be learned
                 gain, each = theta[b : b + nb], theta[products : products + 2 * nb].reshape(2, nb)
                 limit = INSIDE * basis.u_max
-                found = basis.own_numbers[:2] if unseen else each @ gain / max(float(gain @ gain), 1e-300)
+                found = basis.parameters[:2] if unseen else each @ gain / max(float(gain @ gain), 1e-300)
                 found = np.clip(found, [0.0, -limit], [limit, 0.0])
                 moved = max(moved, float(np.max(np.abs(found - last[i]))) / basis.u_max)
                 last[i] = found

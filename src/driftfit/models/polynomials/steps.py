@@ -244,8 +244,7 @@ def point(p: Places, place: Step, waiting: float = ENTRY) -> Any:
                 s.damped[at_f[j] + i, l] = scale * s.point[at_f[j] + i, l]
                 scale *= inner
 
-    step: Step = linearise
-    return step
+    return linearise
 
 
 @lru_cache
@@ -273,8 +272,7 @@ def taking_inputs(p: Places) -> Step:
                 x += s.damped[at_f[j] + i, l] * s.signals[own + UF, i + 1, l]
             s.signals[own + UF, 0, l] = filtered(s, x, held - about, 1 + j, l)
 
-    step: Step = take_inputs
-    return step
+    return take_inputs  # type: ignore[no-any-return]
 
 
 @lru_cache
@@ -300,8 +298,7 @@ def _responses(p: Places) -> Any:
             total += w
         return total
 
-    step: Step = respond
-    return step
+    return respond
 
 
 @lru_cache
@@ -368,8 +365,7 @@ def gradient_of(p: Places) -> Any:
         for i in range(nd):
             s.phi[at_d + i, l] = s.signals[VF, i + 1, l] if settled else s.signals[V, i + 1, l]
 
-    step: Step = gradient
-    return step
+    return gradient
 
 
 @lru_cache
@@ -394,8 +390,7 @@ def ageing(p: Places) -> Any:
             for r in range(V, ONE):
                 s.signals[r, i, l] = 0.0 if broken else s.signals[r, i, l]
 
-    step: Step = age
-    return step
+    return age
 
 
 @lru_cache
@@ -419,8 +414,7 @@ def regressing(p: Places, place: Step, regressors: Any, waiting: float = ENTRY) 
         known = (s.usable[l] >= SETTLING * n) & credible(s, shift, 0, l)
         subtract(s, shift if known else 0.0, complete, l)
 
-    step: Step = regress
-    return step
+    return regress  # type: ignore[no-any-return]
 
 
 @lru_cache
@@ -483,8 +477,7 @@ def pushing(p: Places, place: Step, waiting: float = ENTRY) -> Step:
         if (first_f > 0) & (s.usable[l] < SETTLING * n):
             s.signals[OWN + W, 0, l] = responding(s, y, s.signals[OWN + W, 0, l], l)
 
-    step: Step = push
-    return step
+    return push  # type: ignore[no-any-return]
 
 
 @lru_cache

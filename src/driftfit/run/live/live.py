@@ -411,8 +411,7 @@ class Live(Batched):
     @property
     def regressors(self) -> Array:
         """The regressors of the last sample, (n,)."""
-        phi: Array = self._tile["phi"][0, :, 0].copy()
-        return phi
+        return np.asarray(self._tile["phi"][0, :, 0].copy())
 
     def _of_lanes(self, name: str) -> Array:
         """A field (n,) of the one theta, or (ny, n)."""

@@ -129,8 +129,7 @@ def triangular_root(q: Array) -> Array:
 
     unit = np.sqrt(np.where(variances > 0.0, variances, 1.0))
     values, vectors = linalg.eigh(q / np.outer(unit, unit))
-    G: Array = unit[:, None] * linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r")
-    return G
+    return np.asarray(unit[:, None] * linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r"))
 
 
 def partly_known(small: Mapping[str, Any], large: Mapping[str, Any]) -> Mapping[str, Any] | None:

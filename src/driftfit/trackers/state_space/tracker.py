@@ -94,8 +94,7 @@ def _variances_of(owner: str, name: str, given: Any, model: Model) -> Any:
     for key, _ in given:
         if key not in model.names:
             raise ValueError(f"{owner}: {name} names {key!r}; {near(key, model.names)}")
-    found: Array = np.array([dict(given).get(one, 0.0) for one in model.names])
-    return found
+    return np.asarray(np.array([dict(given).get(one, 0.0) for one in model.names]))
 
 
 def _pairs(given: Any) -> bool:
