@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from driftfit import ARX, RLS, AugmentedFLS, DataWarning, Kalman, Live, Regression, track
+from driftfit import ARX, RLS, AugmentedFLS, Bank, DataWarning, Kalman, Live, Regression, track
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 KINDS = [TRACKER, RLS(0.99), AugmentedFLS(mu=1.0)]
@@ -31,6 +31,12 @@ def test_a_wrong_column_name_lists_near_matches(argument):
     assert message(ValueError, **names, data=table()) == "the table has no column 'Flo': did you mean flow?"
     names[argument] = "zzz"
     assert message(ValueError, **names, data=table()) == "the table has no column 'zzz': there is unit, t, flow, u."
+
+
+def test_limits_and_hypotheses_of_another_kind_are_named():
+    assert message(ValueError, "flow", "u", data=table(), limits=(0, 1)).endswith("as in {'y': (0, 80)}; got (0, 1).")
+    with pytest.raises(ValueError, match=r"changes must list at least one hypothesis, each a Change; got \(3,\)"):
+        Bank(changes=3)
 
 
 def test_text_in_a_numeric_column_is_named_with_its_row(tmp_path):

@@ -108,7 +108,7 @@ class Bank(Tracker):
         for name, kind in PARTS.items():
             given = getattr(self, name)
             if given is not None:
-                given = (given,) if isinstance(given, kind) else tuple(given)
+                given = tuple(given) if isinstance(given, list | tuple) else (given,)
                 if not given or not all(isinstance(one, kind) for one in given):
                     raise ValueError(
                         f"Bank: {name} must list at least one hypothesis, each a {kind.__name__}; got {given!r}."

@@ -36,6 +36,8 @@ class Limits:
     """
 
     def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
+        if not isinstance(limits, Mapping):
+            raise ValueError(f"limits: give a (low, high) for each signal, as in {{'y': (0, 80)}}; got {limits!r}.")
         self.given, self.ny = dict(limits), len(outputs)
         self.names = (*outputs, *(inputs or (f"u{j + 1}" for j in range(m))))
         self.low, self.high = np.full(self.ny + m, -np.inf), np.full(self.ny + m, np.inf)

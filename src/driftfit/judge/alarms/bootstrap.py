@@ -162,8 +162,8 @@ def limits(statistic: Array, every: float) -> tuple[Array, Array, float]:
     in groups makes no difference to this. The exponent of a rate, and so its error, grows with the square of the limit.
     """
     samples = statistic[..., 0].size
-    base = min(every, max(samples / ENOUGH, STEP * OFTEN))
-    often = max(base / STEP, OFTEN)
+    base = max(min(every, samples / ENOUGH), STEP * OFTEN)
+    often = base / STEP
     share = np.array(SHARES) / np.sum(SHARES)
     near, nearer = (
         np.array([exceeded(one, samples / rate * part) for one, part in zip(statistic.T, share, strict=True)])
