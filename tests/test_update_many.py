@@ -68,7 +68,7 @@ def test_several_outputs(case, lag):
 def test_alarms_and_windows(kind):
     y, u = damaged(*arx_record(360, 5), share=0.02)
     before = track(ARX(2, 2), K, y[:300], u[:300])
-    rule = before.detect(kind, every=30.0, reference=300).rule
+    rule = before.detect(kind, every=10.0, reference=300).rule
     y[310:] += 0.5
     streams = [Live(ARX(2, 2), K, warm_start=before, dt=timedelta(minutes=1)) for _ in range(2)]
     alarms = [live.detect(rule) for live in streams]
