@@ -62,7 +62,7 @@ def after_jump(lane, phi, y):
     """The same as `before`, with jumps as large as an unusual innovation."""
     mean, variance = expected(lane, phi)
     square = (y - mean) ** 2 * ((y - mean) ** 2 > filters.LARGE * variance)
-    return before(lane, phi, max(JUMPS, square / lane["noise"] / lane["r"]))
+    return before(lane, phi, max(JUMPS, min(lane["power"], square / lane["noise"]) / lane["r"]))
 
 
 def states(lane):

@@ -10,11 +10,12 @@
 | learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters), or for those of a group | .003, .05, 1, J |
 
-J, the largest jump, is 1000, or e^2 / r where that is more. It lasts for two samples: then the filter goes on with the
-next smaller ratio. Every mode is a Kalman filter. They are merged after every sample. Noise is quiet, restless, or an
-outlier of any size, and coarse readings that repeat share their rounding (`driftfit.trackers.mixture.filters`). Scales,
-means, colour of the noise and covariance of the drift are learned (`driftfit.trackers.mixture.learned`). Readings are
-judged by a gate (`driftfit.readings.gate`), which is on for this tracker, and not here.
+J, the largest jump, is 1000, or e^2 / r where that is more, but not more than the mean square of y. It lasts for two
+samples: then the filter goes on with the next smaller ratio. Every mode is a Kalman filter. They are merged after every
+sample. Noise is quiet, restless, or an outlier of any size, and coarse readings that repeat share their rounding
+(`driftfit.trackers.mixture.filters`). Scales, means, noise, its colour and the covariance of the drift are learned
+(`driftfit.trackers.mixture.learned`). Readings are judged by a gate (`driftfit.readings.gate`), which is on for this
+tracker, and not here.
 
 The results are the mean and covariance of the mixture, the latter enlarged because probabilities of filters and r are
 estimates themselves. The variance before a sample is for samples that are no outliers: the geometric mean, by their
@@ -49,99 +50,31 @@ from driftfit.engine.kernel import Array, State, kernel, nothing
 from driftfit.engine.settings import numbers, whole
 from driftfit.readings.repeats import note_reading
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.forms.coordinates import (
-    frame,
-    located_within,
-    unseen_variance,
-    whiten_within,
-)
-from driftfit.trackers.forms.covariance import prediction
-from driftfit.trackers.forms.diffuse import ENTERING, MACHINES, knowing_nothing, spanned_variance
-from driftfit.trackers.forms.excitation import (
-    FIRST,
-    learn_information,
-    learn_scales,
-    learned,
-    no_excitation,
-    window,
-)
+from driftfit.trackers.forms.coordinates import located_within, unseen_variance
+from driftfit.trackers.forms.diffuse import MACHINES, knowing_nothing, spanned_variance
+from driftfit.trackers.forms.excitation import FIRST, learned, no_excitation, window
 from driftfit.trackers.forms.information import partly_known
 from driftfit.trackers.mixture.filters import (
     FAR,
     MOST_ALONE,
-    OUTLYING,
     STILL,
     bank,
-    enter_filters,
-    innovate,
-    least_noise,
     mix,
     mixture,
-    noise_prior,
     predict,
-    repeated_rounding,
-    update_filters,
-    weigh,
 )
 from driftfit.trackers.mixture.learned import (
     MEMORY_OF_R,
     colour,
+    follow,
     forecast_start,
-    learn_colour,
-    learn_drift,
-    learn_means,
-    learn_noise,
+    look_ahead,
     nothing_learned,
+    settle,
     start_density,
     take_start,
-    whiten_noise,
 )
 from driftfit.trackers.student import RESIDUALS, widen_estimates, wider
-
-
-@partial(kernel, short=True)
-def settle(s: State, l: int) -> None:
-    """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
-    s.r[l] = max(s.scale[l], least_noise(s, l))
-    s.scale[l] = 1.0
-    for i in range(s.theta.shape[0]):
-        for k in range(s.modes[l]):
-            s.m[i, k, l] = s.d[i, l]
-            s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
-    frame(s, l)
-    s.restless[l], s.usual_noise[l], s.remembered[l] = s.r[l], s.r[l], 0
-
-
-@partial(kernel, inline=False)
-def look_ahead(s: State, l: int) -> None:
-    """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
-    frame(s, l)
-    whiten_noise(s, l)
-    column = whiten_within(s, s.white[:, l], l)
-    noise_prior(s, l)
-    innovate(s, l)
-    if column >= 0:
-        s.y_hat[l] = prediction(s, l)
-        s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
-
-
-@partial(kernel, inline=False)
-def follow(s: State, l: int) -> None:
-    """One sample of the running filters."""
-    s.nu[OUTLYING, l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
-    column = int(s.at_start[ENTERING, l])
-    if s.ok[l] > 0.0 and column >= 0:
-        enter_filters(s, column, l)
-    elif s.ok[l] > 0.0:
-        weighed = 1.0
-        weigh(s, repeated_rounding(s, l), l)
-        update_filters(s, l)
-        learn_drift(s, l)
-        learn_noise(s, l)
-    learn_colour(s, weighed, l)
-    learn_scales(s, l)
-    learn_means(s, l)
-    learn_information(s, s.noise[l], l)
 
 
 @kernel

@@ -181,14 +181,6 @@ def variance_in(s: State, j: int, l: int) -> float:
 
 
 @kernel
-def noise_prior(s: State, l: int) -> None:
-    """Probabilities of the states before the sample."""
-    usual = 1.0 - s.nu_prior[OUTLYING, l]
-    s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
-    s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
-
-
-@kernel
 def repeated_rounding(s: State, l: int) -> float:
     """Variance that a repeated reading adds to its noise."""
     return s.alike[l] * min(s.finest[l] * s.finest[l] / 12.0, s.noise[l] * s.r[l])  # type: ignore[no-any-return]
@@ -353,7 +345,7 @@ def weigh(s: State, more: float, l: int) -> None:
     K = s.modes[l]
     likelihoods(s, s.vague[l], l)
     predictive_density(s, l)
-    size = s.e[l] * s.e[l] / s.noise[l] - JUMPS * s.r[l]
+    size = min(s.power[l], s.e[l] * s.e[l] / s.noise[l]) - JUMPS * s.r[l]
     leaps = (size > 0.0) & (s.e[l] * s.e[l] > LARGE * s.s[l]) & (s.dt[l] * s.drift[l] > 0.0)
     if leaps:
         for k in range(K):

@@ -41,10 +41,13 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, exp, kernel, log, shared
-from driftfit.trackers.forms.diffuse import absorb_on_roots, forecast_on_roots
+from driftfit.trackers.forms.coordinates import frame, whiten_within
+from driftfit.trackers.forms.covariance import prediction
+from driftfit.trackers.forms.diffuse import ENTERING, absorb_on_roots, forecast_on_roots
 from driftfit.trackers.forms.excitation import DULL, FIRST, LARGE, MEMORY, learn_information, learn_scales
 from driftfit.trackers.mixture.filters import (
     ASSUMED,
+    CALM,
     DIRECTION,
     FIRST_ALONE,
     FIRST_LEARNED,
@@ -54,6 +57,7 @@ from driftfit.trackers.mixture.filters import (
     SHIFT,
     SLOPE,
     STATES,
+    STAY,
     WEIGHT,
     A,
     B,
@@ -61,10 +65,14 @@ from driftfit.trackers.mixture.filters import (
     N,
     T,
     V,
+    enter_filters,
+    innovate,
     least_noise,
     repeated_rounding,
     sum_of_row,
+    update_filters,
     variance_in,
+    weigh,
 )
 
 MEMORY_OF_R, QUICK, RARITY, OFTEN = 70.0, 2.0, 50.0, 1000.0
@@ -97,6 +105,14 @@ def nothing_learned(n: int) -> dict[str, Any]:
         "white": np.zeros(n), "past": np.zeros(n), "past_y": 0.0, "explained": 0.0, "colour": 0.0, "psi": 0.0,
         "colour_scores": np.zeros(3),
     }  # fmt: skip
+
+
+@kernel
+def noise_prior(s: State, l: int) -> None:
+    """Probabilities of the states before the sample."""
+    usual = 1.0 - s.nu_prior[OUTLYING, l]
+    s.nu_prior[0, l] = usual * (STAY * s.nu[0, l] + (1.0 - CALM) * s.nu[1, l])
+    s.nu_prior[1, l] = usual * ((1.0 - STAY) * s.nu[0, l] + CALM * s.nu[1, l])
 
 
 @partial(kernel, inline=False)
@@ -406,3 +422,48 @@ def take_start(s: State, l: int) -> None:
         s.count[l] += s.ok[l]  # the scale is NaN until there is a residual
         s.scale[l] = (sum_before + s.ok[l] * s.e[l] * s.e[l] / (s.h[l] + s.r[l] * s.noise[l])) / s.count[l]
     s.remembered[l] += int(s.ok[l])
+
+
+@partial(kernel, short=True)
+def settle(s: State, l: int) -> None:
+    """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
+    s.r[l] = max(s.scale[l], least_noise(s, l))
+    s.scale[l] = 1.0
+    for i in range(s.theta.shape[0]):
+        for k in range(s.modes[l]):
+            s.m[i, k, l] = s.d[i, l]
+            s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
+    frame(s, l)
+    s.restless[l], s.usual_noise[l], s.remembered[l] = s.r[l], s.r[l], 0
+
+
+@partial(kernel, inline=False)
+def look_ahead(s: State, l: int) -> None:
+    """Prediction of the filters, and its variance; x, and the column by which the regressor leaves the span, or -1."""
+    frame(s, l)
+    whiten_noise(s, l)
+    column = whiten_within(s, s.white[:, l], l)
+    noise_prior(s, l)
+    innovate(s, l)
+    if column >= 0:
+        s.y_hat[l] = prediction(s, l)
+        s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
+
+
+@partial(kernel, inline=False)
+def follow(s: State, l: int) -> None:
+    """One sample of the running filters."""
+    s.nu[OUTLYING, l], s.usual_noise[l], weighed = 0.0, s.r[l], 0.0
+    column = int(s.at_start[ENTERING, l])
+    if s.ok[l] > 0.0 and column >= 0:
+        enter_filters(s, column, l)
+    elif s.ok[l] > 0.0:
+        weighed = 1.0
+        weigh(s, repeated_rounding(s, l), l)
+        update_filters(s, l)
+        learn_drift(s, l)
+        learn_noise(s, l)
+    learn_colour(s, weighed, l)
+    learn_scales(s, l)
+    learn_means(s, l)
+    learn_information(s, s.noise[l], l)
