@@ -80,7 +80,7 @@ class Minimal(Tracker):
         """
         return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
-    def state(self, n: int) -> Mapping[str, Any]:
+    def _of_parameters(self, n: int) -> dict[str, Any]:
         """The fields that depend only on the number n of minimal parameters."""
         owner, of_q = type(self).__name__, matrix if np.ndim(self.q) == 2 else vector
         return {
@@ -181,7 +181,7 @@ class ExtendedKalman(Minimal):
 
     def state(self, n: int) -> Mapping[str, Any]:
         more = {"g": np.zeros(n), "drift_root": np.ones(n), "h_row": np.zeros(n)}
-        return {**super().state(n), **more, "inflation": self.inflation}
+        return {**self._of_parameters(n), **more, "inflation": self.inflation}
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         return self.state(structure_of("ExtendedKalman", model).n_x)

@@ -298,6 +298,9 @@ class OutputError(Minimal):
     def __post_init__(self) -> None:
         self._check("q_w", "p_w")
 
+    def state(self, n: int) -> Mapping[str, Any]:
+        return self._of_parameters(n)
+
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("OutputError", model)
         n_w, state = max(structure.na, 1), self.state(structure.n_x)
