@@ -80,6 +80,14 @@ class Minimal(Tracker):
         """
         return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
+    def _of_parameters(self, n: int) -> dict[str, Any]:
+        """The fields that depend only on the number n of minimal parameters."""
+        owner, of_q = type(self).__name__, matrix if np.ndim(self.q) == 2 else vector
+        return {
+            "theta": vector(owner, "theta0", self.theta0, n), "P": matrix(owner, "p0", self.p0, n),
+            "q": of_q(owner, "q", self.q, n), "r": self.r, "var": np.zeros(n), "minimal": 1.0,
+        }  # fmt: skip
+
     @property
     def steps(self) -> TrackerSteps:
         raise ValueError(f"{type(self).__name__}: the steps depend on the model; see steps_for.")
@@ -172,22 +180,11 @@ class ExtendedKalman(Minimal):
         self._check("inflation")
 
     def state(self, n: int) -> Mapping[str, Any]:
-        """The state for n minimal parameters."""
-        together = np.ndim(self.q) == 2
-        return {
-            "theta": vector("ExtendedKalman", "theta0", self.theta0, n),
-            "P": matrix("ExtendedKalman", "p0", self.p0, n),
-            "q": (matrix if together else vector)("ExtendedKalman", "q", self.q, n),
-            "r": self.r,
-            "inflation": self.inflation,
-            "g": np.zeros(n),
-            "drift_root": np.ones(n),
-            "h_row": np.zeros(n),
-            "var": np.zeros(n),
-        }
+        more = {"g": np.zeros(n), "drift_root": np.ones(n), "h_row": np.zeros(n)}
+        return {**self._of_parameters(n), **more, "inflation": self.inflation}
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        return {**self.state(structure_of("ExtendedKalman", model).n_x), "minimal": 1.0}
+        return self.state(structure_of("ExtendedKalman", model).n_x)
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)

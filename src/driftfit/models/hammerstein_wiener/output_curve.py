@@ -109,20 +109,11 @@ def accept(s: State, y: float, l: int) -> None:
 
 
 @kernel
-def grid_level(s: State, i: int, l: int) -> float:
-    """sum_k d_k g_k at point i of the grid."""
-    total = s.grid_values[0, i, l]
+def at_point(s: State, table: Array, i: int, l: int) -> float:
+    """sum_k d_k times entry k of a table at point i of the grid: the level of the output block, or its slope."""
+    total = table[0, i, l]
     for k in range(1, s.d_now.shape[0]):
-        total += s.d_now[k, l] * s.grid_values[k, i, l]
-    return total  # type: ignore[no-any-return]
-
-
-@kernel
-def grid_slope(s: State, i: int, l: int) -> float:
-    """Its slope there."""
-    total = s.grid_slopes[0, i, l]
-    for k in range(1, s.d_now.shape[0]):
-        total += s.d_now[k, l] * s.grid_slopes[k, i, l]
+        total += s.d_now[k, l] * table[k, i, l]
     return total  # type: ignore[no-any-return]
 
 
@@ -130,7 +121,7 @@ def grid_slope(s: State, i: int, l: int) -> float:
 def check(s: State, l: int) -> None:
     """Check whether the levels increase, and how far d may change until the next check; if not, make the envelope."""
     for i in range(GRID):
-        s.envelope[i, l] = grid_level(s, i, l)
+        s.envelope[i, l] = at_point(s, s.grid_values, i, l)
     falls = 0
     for i in range(GRID - 1):
         falls += 0 if s.envelope[i + 1, l] > s.envelope[i, l] else 1
@@ -181,13 +172,14 @@ def inverting(functions: Any) -> Any:
     def solve(s: State, right: float, below: int, l: int) -> float:
         """In a cell of the grid."""
         step, start = s.grid_step[l], s.grid_low[l]
-        before, after = grid_level(s, below, l), grid_level(s, below + 1, l)
+        before, after = at_point(s, s.grid_values, below, l), at_point(s, s.grid_values, below + 1, l)
         if right < before:
             return start  # type: ignore[no-any-return]
         if right >= after:
             return start + (GRID - 1) * step  # type: ignore[no-any-return]
-        first, final, rise = grid_slope(s, below, l), grid_slope(s, below + 1, l), after - before
-        mean, left = rise / step, start + below * step
+        first, final = at_point(s, s.grid_slopes, below, l), at_point(s, s.grid_slopes, below + 1, l)
+        rise, left = after - before, start + below * step
+        mean = rise / step
         y = left + step * cubic((right - before) / rise, mean, first, final)
         bend = abs(first - mean) + abs(final - mean)
         for _ in range(NEWTON_STEPS):
@@ -208,7 +200,7 @@ def inverting(functions: Any) -> Any:
         below, above = 0, GRID - 1
         while above - below > 1:
             middle = (below + above) // 2
-            here = grid_level(s, middle, l) if rising else s.envelope[middle, l]
+            here = at_point(s, s.grid_values, middle, l) if rising else s.envelope[middle, l]
             under = here <= right
             below = middle if under else below
             above = above if under else middle

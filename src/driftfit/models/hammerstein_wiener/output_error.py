@@ -30,11 +30,11 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
-from driftfit.engine.settings import matrix, vector
+from driftfit.engine.settings import matrix
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.extended_kalman import Minimal, structure_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.output_curve import GRID, grid_level, inverting, rises, trying
+from driftfit.models.hammerstein_wiener.output_curve import GRID, at_point, inverting, rises, trying
 from driftfit.models.hammerstein_wiener.steps import Input, driven
 from driftfit.models.hammerstein_wiener.structure import Structure
 from driftfit.trackers.forms.covariance import LEFT
@@ -187,8 +187,8 @@ def reach_of(s: State, curved: bool, l: int) -> float:
     low, high = s.y_lowest[l], s.y_highest[l]
     if curved:
         rising, last = rises(s, l), GRID - 1
-        low = grid_level(s, 0, l) if rising else s.envelope[0, l]
-        high = grid_level(s, last, l) if rising else s.envelope[last, l]
+        low = at_point(s, s.grid_values, 0, l) if rising else s.envelope[0, l]
+        high = at_point(s, s.grid_values, last, l) if rising else s.envelope[last, l]
     reach = W_RANGE * max(abs(low), abs(high))
     return reach if reach > 0.0 and reach < LARGEST else LARGEST
 
@@ -299,14 +299,7 @@ class OutputError(Minimal):
         self._check("q_w", "p_w")
 
     def state(self, n: int) -> Mapping[str, Any]:
-        """The part of the state that depends only on the number n of minimal parameters."""
-        return {
-            "theta": vector("OutputError", "theta0", self.theta0, n),
-            "P": matrix("OutputError", "p0", self.p0, n),
-            "q": matrix("OutputError", "q", self.q, n),
-            "r": self.r,
-            "var": np.zeros(n),
-        }
+        return self._of_parameters(n)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("OutputError", model)
@@ -316,8 +309,8 @@ class OutputError(Minimal):
         S = np.zeros((N, N))
         S[n_w:, n_w:] = state["P"]
         return {
-            **state, "minimal": 1.0, "w": np.zeros(n_w), "S": S, "row": np.zeros(N), "moved": np.zeros(N),
-            "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0, "unknown": 0.0,
+            **state, "q": matrix("OutputError", "q", self.q, structure.n_x), "w": np.zeros(n_w), "S": S,
+            "row": np.zeros(N), "moved": np.zeros(N), "q_w": self.q_w, "p_w": self.p_w, "begun": 0.0, "unknown": 0.0,
             "least_slope": SLOPE_SHARE * model.out.steepness, "v_power": np.zeros(model.m),
         }  # fmt: skip
 

@@ -196,8 +196,9 @@ def _filling(s: Structure, inputs: tuple[Input, ...]) -> Any:
         for k in range(one.n_in)
         for j in range(one.nb)
     ])  # fmt: skip
-    from_outputs = np.array([(s.starts[2] + (k - 1) * s.na + i if k else i, i, k) for k in range(s.n_out)
-                             for i in range(s.na)]).reshape(-1, 3)  # fmt: skip
+    lags = [(k, i) for k in range(s.n_out) for i in range(s.na)]
+    columns = [(s.starts[2] + (k - 1) * s.na + i if k else i, i, k) for k, i in lags]
+    from_outputs = np.array(columns, np.int64).reshape(-1, 3)
     inside, outside, last, n = len(from_inputs), len(from_outputs), s.n - s.intercept, s.n
 
     @kernel
