@@ -36,6 +36,7 @@ def plant(T=200, codes=()):
 
 def test_what_was_left_out_is_a_table():
     run = track(PLANT, TRACKER, *plant(codes=[5, 100]), gate=True)
+    assert run.left_out.decided.tolist() == [17, 100]  # the first samples are judged together
     lines = str(run.left_out).splitlines()
     assert [line.split()[:3] for line in lines[1:]] == [["5", "y", "9999"], ["100", "y", "9999"]]
     assert str(track(PLANT, TRACKER, *plant(), gate=True).left_out) == "nothing left out"
@@ -121,6 +122,10 @@ def test_off_is_said_once_with_the_values_and_the_remedy():
     with pytest.warns(DataWarning, match=r"y: 2 values .*\(9999\); u: 1 value looks .*\(-9999\)") as said:
         track(PLANT, TRACKER, np.stack([y, clean, clean]), np.stack([u, u, strange]), by="row")
     assert len(said) == 1
+    live = Live(PLANT, TRACKER)
+    with pytest.warns(DataWarning, match=r"^Live.update_many: y: 2 values .*\(9999\).*gate=True"):
+        live.update_many(y, u)
+    live.update_many(y, u)
 
 
 @pytest.mark.parametrize("what", ["nothing", "jump", "pulse"])
@@ -133,6 +138,7 @@ def test_what_is_no_code_is_not_warned_of(what):
         for t in range(1, 200):
             y[t] = 0.8 * y[t - 1] + u[t - 1]
     track(PLANT, TRACKER, y, u)
+    Live(PLANT, TRACKER).update_many(y, u)
 
 
 def test_tuning_takes_the_decisions_of_one_reference_run():

@@ -24,8 +24,7 @@ from driftfit.engine.drivers import COMMON, DRIFT, INTERVAL, LARGEST, NOISE, SMA
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import warn
 from driftfit.models.base import Model
-from driftfit.readings.gate import LIMITS
-from driftfit.readings.left_out import NONE, LeftOut
+from driftfit.readings.left_out import LeftOut
 from driftfit.trackers.base import Tracker
 
 
@@ -280,27 +279,10 @@ class Records(NamedTuple):
         reasons = {f"of {name} outside its limits": of for name, of in zip(limits.names, counts.T, strict=True)}
         none = np.hstack([none_y.reshape(N, -1), none_u.reshape(N, -1)]).sum(axis=1)
         missing = marked(keys, owner, {**reasons, "marked as missing": none * ~excluded, "excluded": excluded})
-        outside = np.hstack([out_y, out_u.reshape(N, -1, m).any(axis=1)]) & ~excluded[:, None]
-        named = (*(self.outputs or ("y",)), *(inputs or (("u",) if m == 1 else limits.names[self.ny :])))
-        left_out = self._outside(outside, np.array(named), y.reshape(N, -1)) if outside.any() else self.left_out
         y[out_y.reshape(y.shape)] = np.nan
         u[out_u] = np.nan
         y[excluded], u[excluded] = np.nan, np.nan
-        return self._replace(y=y, u=u, missing=missing, left_out=left_out)
-
-    def _outside(self, outside: Array, names: Array, y: Array) -> dict[Hashable, LeftOut]:
-        """What is outside its limits (N, ny + m), by series, of several outputs with a theta each also by output."""
-        found: dict[Hashable, LeftOut] = {}
-        for k, key in enumerate(self.keys):
-            begin, count = self.first.item(k), self.length.item(k)
-            for lane, output in enumerate(self.outputs or ("",)):
-                own = outside[begin : begin + count].copy()
-                own[:, : self.ny] &= np.arange(self.ny) == lane
-                sample, signal = np.nonzero(own)
-                code = np.full(len(sample), LIMITS)
-                one = LeftOut(sample, code, y[begin + sample, lane], names[signal], sample, NONE, NONE)
-                found[(key, output) if output else key] = one
-        return found
+        return self._replace(y=y, u=u, missing=missing)
 
 
 @dataclass(frozen=True)

@@ -257,8 +257,8 @@ class Body(Statements):
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
             name = identifier(argument.arg)
             if one.kind in ("record", "tile"):
-                own = ["tracker_state *s", "scratch_fields *scratch"]
-                self.parameters += [text for text in own if text not in self.parameters]  # a gate's record is the same
+                state = ["tracker_state *s", "scratch_fields *scratch"]
+                self.parameters += [text for text in state if text not in self.parameters]  # that of a gate is the same
                 named[argument.arg] = one
             elif one.kind in ("array", "address"):  # an address is one of real numbers
                 constant = "const " if one.kind == "array" and one.text == "u" else ""

@@ -106,18 +106,15 @@ def usual_value(g: State, column: int, center: float, apart: bool, l: int) -> fl
 def judge_each(g: State, implicit: bool, l: int) -> None:
     """Write for each sample 1 if its reading is outlying, 2 if a regressor is, else 0."""
     N, n, PHI = g.gate_doubt.shape[0], g.gate_fit.shape[0] - 1, U + g.gate_low.shape[0]
-    center = usual_value(g, READING, 0.0, False, l)
-    most = OUTLYING * usual_value(g, READING, center, True, l)
-    for k in range(N):
-        g.gate_doubt[k, l] = 1.0 if abs(g.gate_first[k, READING, l] - center) > most else 0.0
-    for i in range(n):
-        center = usual_value(g, PHI + i, 0.0, False, l)
-        most = OUTLYING * usual_value(g, PHI + i, center, True, l)
+    for i in range(-1, n):
+        column = PHI + i if i >= 0 else READING
+        center = usual_value(g, column, 0.0, False, l)
+        most = OUTLYING * usual_value(g, column, center, True, l)
         for k in range(N):
-            x, d = g.gate_first[k, PHI + i, l], g.gate_doubt[k, l]
+            x, d = g.gate_first[k, column, l], g.gate_doubt[k, l] if i >= 0 else 0.0
             same = (implicit | (abs(x) == abs(g.gate_first[k, READING, l]))) & (d == 1.0)
-            if (abs(x - center) > most) & (d < 2.0) & (not same):
-                g.gate_doubt[k, l] = d + 2.0
+            outlying = (abs(x - center) > most) & (d < 2.0) & (not same)
+            g.gate_doubt[k, l] = d + (0.0 if not outlying else 1.0 if i < 0 else 2.0)
     for k in range(N):
         g.gate_doubt[k, l] = g.gate_doubt[k, l] if g.gate_doubt[k, l] < 3.0 else 0.0
 

@@ -54,8 +54,8 @@ CLIPPED = 10.0
 """Variances of the readings that one which contradicts its forecast adds, at most."""
 LONGER = 4
 """Times `Gate.hold` for which a code is held back where the forecast moves and readings do not repeat by nature."""
-USED, REFUSED, FROZEN, INPUT, AT_START, LIMITS = range(6)
-"""Reasons: what was decided of a sample; the last is no decision of a gate, but the user's."""
+USED, REFUSED, FROZEN, INPUT, AT_START = range(5)
+"""Reasons: what was decided of a sample."""
 SIGNAL = 8
 """A decision is a reason plus this many times the signal that it is about: 0 for the output, 1 + j for input j. Of
 several inputs it is the first."""

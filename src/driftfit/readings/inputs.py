@@ -34,12 +34,6 @@ def no_inputs(m: int) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-@kernel
-def forget(g: State, j: int, k: int) -> None:
-    """Nothing is outside any more."""
-    g.gate_outside[j, k], g.gate_lowest[j, k], g.gate_highest[j, k] = 0, np.inf, -np.inf
-
-
 def input_rules(gate: Any) -> tuple[Any, Any]:
     """``notice(s, l, g, k, ages, known)``, which takes in the inputs of a sample if the model remembers those of
     ``ages`` others, and ``blame(g, k, contradicts, usual)``, the number of the first that is blamed for it, or 0.
@@ -52,7 +46,7 @@ def input_rules(gate: Any) -> tuple[Any, Any]:
             u, low, high = s.u[j, l], g.gate_low[j, k], g.gate_high[j, k]
             if (g.gate_outside[j, k] >> min(ages, LONGEST)) & 1 > 0:  # leaves the memory without blame
                 low, high = min(low, g.gate_lowest[j, k]), max(high, g.gate_highest[j, k])
-                forget(g, j, k)
+                g.gate_outside[j, k], g.gate_lowest[j, k], g.gate_highest[j, k] = 0, np.inf, -np.inf
             strange = known & (abs(u) < np.inf) & (abs(2.0 * u - (low + high)) > away * (high - low))
             g.gate_outside[j, k] = (g.gate_outside[j, k] << 1) | (1 if strange else 0)
             if strange:
@@ -87,6 +81,6 @@ def taking_out(refuse: Callable[[State, int, int, int], None], blamed: int, memo
                 for age in range(LONGEST, -1, -1):
                     if (g.gate_outside[j, k + l] >> age) & 1 > 0:
                         refuse(s, j, age, l)
-                forget(g, j, k + l)
+                g.gate_outside[j, k + l], g.gate_lowest[j, k + l], g.gate_highest[j, k + l] = 0, np.inf, -np.inf
 
     return take_out

@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.readings.gate import AT_START, FROZEN, INPUT, LIMITS, REFUSED
+from driftfit.readings.gate import AT_START, FROZEN, INPUT, REFUSED
 
 SAID: Mapping[int, tuple[str, str]] = {
     REFUSED: ("Left out", "far outside the range of the others, which the model did not predict"),
     FROZEN: ("Frozen", "repeating the one before although the forecast moved"),
     INPUT: ("Inputs left out", "with an input far outside its range to which the output did not respond"),
     AT_START: ("Left out at the start", "contradicted by the others among the first"),
-    LIMITS: ("Outside its limits", "outside the limits that were given"),
 }
 """For each reason its label in a summary, and what is said of the samples."""
 NONE = np.empty(0, int)
@@ -58,19 +57,8 @@ class LeftOut:
 
     def __iter__(self) -> Iterator[Decision]:
         columns = (one.tolist() for one in (self.sample, self.signal, self.value, self.code, self.decided))
-        for sample, signal, value, code, decided in zip(*columns, strict=True):
-            yield Decision(sample, signal, value, SAID[code][1], decided)
-
-    def beside(self, limits: LeftOut) -> LeftOut:
-        """These decisions, and the readings outside their limits in others."""
-        pairs = ((one, other[limits.code == LIMITS]) for one, other in zip(self._rows, limits._rows, strict=True))
-        columns = [np.concatenate(pair) for pair in pairs]
-        order = np.argsort(columns[0], kind="stable")
-        return LeftOut(*(one[order] for one in columns), self.refused, self.unused)
-
-    @property
-    def _rows(self) -> tuple[Array, ...]:
-        return self.sample, self.code, self.value, self.signal, self.decided
+        for sample, signal, value, code, when in zip(*columns, strict=True):
+            yield Decision(sample, signal, value, SAID[code][1], when)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -108,5 +96,5 @@ def remarks_of(found: LeftOut | Mapping[Any, LeftOut]) -> tuple[tuple[str, str],
     """The lines on what was left out of a record, or of several together."""
     several = [found] if isinstance(found, LeftOut) else found.values()
     total = sum((Counter(one.counts) for one in several), Counter[str]())
-    rows = [(label, total[label], said) for code, (label, said) in SAID.items() if total[label] and code != LIMITS]
+    rows = [(label, total[label], said) for label, said in SAID.values() if total[label]]
     return tuple((label, f"{count} sample{'s' if count > 1 else ''} {said}: not used") for label, count, said in rows)

@@ -27,7 +27,6 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, warn
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT
 from driftfit.run.columns import COLLECTED, OfRecord, attribute, collect
 from driftfit.run.gating import left_out_of
@@ -272,10 +271,8 @@ class Outputs(KeyedResults, OfRecord):
 
     @cached_property
     def _start_decided(self) -> Any:
-        """See `Track`."""
-        if self.programs[0].gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
-            return None
-        return decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)])
+        reason = None if self.programs[0].gate is None else self.in_rows("reason")
+        return decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)], reason)
 
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
@@ -314,7 +311,7 @@ class Outputs(KeyedResults, OfRecord):
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:
                 used, start = self.decided.ok[:, j], self._start_decided[2] if self._start_decided else 0
-                left = left_out_of(self.programs[j], lane.written("reason"), y, used, start).beside(left)
+                left = left_out_of(self.programs[j], lane.written("reason"), y, used, start)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)
         tile = alone.tile()

@@ -19,7 +19,7 @@ from driftfit.data.record import Known, Labels, Record, Records
 from driftfit.engine.kernel import Array
 from driftfit.engine.tiles import repeat_tile
 from driftfit.models.base import Model
-from driftfit.readings.gate import Gate
+from driftfit.readings.gate import AT_START, SIGNAL, Gate
 from driftfit.readings.left_out import LeftOut
 from driftfit.run.gating import First, without_codes
 from driftfit.run.program import Program, State, kept, lanes_of, programs_of, state_of, tile_of
@@ -102,10 +102,14 @@ def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
 
 
 def decided_record(
-    programs: Sequence[Program], record: Record, starts: Sequence[State]
-) -> tuple[Record, Sequence[State], int]:
+    programs: Sequence[Program], record: Record, starts: Sequence[State], reason: Array | None
+) -> tuple[Record, Sequence[State], int] | None:
     """(the record without the codes that a gate finds among its first samples, the fields with which its lanes then
-    begin, the sample at which it finds them), given the programs of the lanes and the fields with which they began."""
+    begin, the sample at which it finds them), given the programs of the lanes, the fields with which they began and
+    what the gate said of every sample; None if it found none.
+    """
+    if reason is None or AT_START not in reason % SIGNAL:
+        return None
     found: list[tuple[int, First]] = []
     tile = tile_of(programs, starts)
     programs[0].drivers().run(tile, *lanes_of(record), programs[0].written(tile, len(record)), found_too=found)

@@ -14,7 +14,6 @@ from driftfit.data.record import Known, Record, Records, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.readings.left_out import NOTHING_LEFT_OUT, LeftOut
 from driftfit.run.columns import OfRecord, attribute
 from driftfit.run.gating import left_out_of
@@ -263,19 +262,16 @@ class Track(Plain, OfRecord):
 
     @cached_property
     def left_out(self) -> LeftOut:
-        """What the gate decided of samples that it did not use as they are, and readings outside their limits."""
+        """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
             return self._left_out
         used, start = self.decided.in_rows("ok") > 0.0, self._start_decided[2] if self._start_decided else 0
-        found = left_out_of(self.program, self.in_rows("reason"), self.record.y, used, start)
-        return found.beside(self._left_out) if len(self._left_out) else found
+        return left_out_of(self.program, self.in_rows("reason"), self.record.y, used, start)
 
     @cached_property
     def _start_decided(self) -> Any:
-        """What `decided_record` returns; nothing if the gate found no codes among the first samples."""
-        if self.program.gate is None or AT_START not in self.in_rows("reason") % SIGNAL:
-            return None
-        return decided_record([self.program], self.record, [self.start or {}])
+        reason = None if self.program.gate is None else self.in_rows("reason")
+        return decided_record([self.program], self.record, [self.start or {}], reason)
 
     @cached_property
     def decided(self) -> Track:

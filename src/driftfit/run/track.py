@@ -252,11 +252,11 @@ def warn_astray(run: Track | KeyedResults) -> None:
         )
 
 
-def warn_ungated(run: Result) -> None:
-    """Warn of readings that look like codes and that no gate judged: once, whatever the number of series."""
+def warn_ungated(run: Result, verb: str = "track") -> bool:
+    """Warn once, for any number of series, of readings that look like codes and that no gate judged; says whether."""
     programs = [run.program] if isinstance(run, Track) else run.programs
     if all(one.gate is not None for one in programs):
-        return
+        return False
     given = run.record if isinstance(run, Track) else run.records
     ny, rows = len(run.model.outputs) or 1, len(programs[0].rows) or 1
     y, u = given.y.reshape(-1, ny), given.u.reshape(len(given.y) // rows, rows * given.u.shape[-1])
@@ -264,13 +264,11 @@ def warn_ungated(run: Result) -> None:
     first, length = given.first // rows, given.length // rows
     inputs = np.any([screen(signal, first, length) for signal in u.T], axis=0) if u.shape[-1] else False
     may = np.stack([screen(signal, first, length) | inputs for signal in y.T], axis=1).reshape(-1, rows)
-    if not may.any():
-        return
-    warn_of_codes("track", [run] if isinstance(run, Track) else run.some(np.any(may, axis=1)))
+    return bool(may.any()) and warn_of_codes(verb, [run] if isinstance(run, Track) else run.some(np.any(may, axis=1)))
 
 
-def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
-    """Warn of the readings of runs without a gate that one would have refused."""
+def warn_of_codes(verb: str, runs: Iterable[Track]) -> bool:
+    """Warn of the readings of runs without a gate that one would have refused; says whether there are any."""
     found: defaultdict[str, list[float]] = defaultdict(list)
     linear = True
     for run in runs:
@@ -281,6 +279,7 @@ def warn_of_codes(verb: str, runs: Iterable[Track]) -> None:
         said = "; ".join(_named(name, values) for name, values in found.items())
         lasting = "" if linear else " An estimate of a model that is not linear in theta may not come back from them."
         warn(f"{verb}: {said}. Such readings enter the estimate; gate=True leaves them out.{lasting}")
+    return bool(found)
 
 
 def _named(name: str, values: Sequence[float]) -> str:
@@ -357,7 +356,9 @@ def decide(model: Model, records: Records, gate: Any) -> tuple[Records, Decision
         programs = programs_of(model, reference, records.labels.u or records.u.shape[-1], gate)
         given = records.in_rows() if model.shared else records
         runs = (_one(programs, given.some(k, k + 1), "std", None, "float64") for k in range(len(records.keys)))
-        left = (run.left_out if isinstance(run, Track) else {one: run[one].left_out for one in run} for run in runs)
+        left: Any = [
+            run.left_out if isinstance(run, Track) else {j: run[j].left_out for j in run.outputs} for run in runs
+        ]
         gate = dict(zip(records.keys, left, strict=True))
     return decided(model, records, gate)
 
@@ -380,7 +381,4 @@ def decided(model: Model, records: Records, gate: Any) -> tuple[Records, Decisio
         for at, one in ((at, gate[own]) for own, at in places.items() if own in gate):
             changed = one.applied(y[at].ravel(), noise[at].ravel())
             y[at], noise[at] = (values.reshape(y[at].shape) for values in changed)
-    listed = {key: one.beside(records.left_out.get(key, NOTHING_LEFT_OUT)) for key, one in gate.items()}
-    return records._replace(
-        y=y, known=records.known.changed(noise=noise), left_out={**records.left_out, **listed}
-    ), gate
+    return records._replace(y=y, known=records.known.changed(noise=noise), left_out=gate), gate

@@ -247,9 +247,8 @@ def tune_outputs(
     tuned = {name: one(Task(some[0].model, *decided_by(some))) for name, some in runs.items()}
     if model.shared:
         return tuned["rows"]
-    keys = records_of(model, y, u, reading, data, by)[1].keys
+    keys, trackers = records_of(model, y, u, reading, data, by)[1].keys, TunedOutputs(tuned).tracker
     gate = {key: {name: some[k].left_out for name, some in runs.items()} for k, key in enumerate(keys)}
-    trackers = {name: found.tracker for name, found in tuned.items()}
     # lags that were missing are predictions, and those of the run are of the tracker that was found
     run: Any = run_quietly(model, trackers, y, u, reading._replace(gate=gate), data, by)
     each = run.values() if by is not None else [run]

@@ -19,9 +19,11 @@ from driftfit.engine.kernel import Array
 from driftfit.readings.gate import AT_START, SIGNAL
 from driftfit.run.columns import SCALARS, Columns, attribute
 from driftfit.run.gating import First
+from driftfit.run.lanes import Lane
 from driftfit.run.live.stream import HELD, Stream, Tally, check_applied
 from driftfit.run.program import Program, lanes_of
-from driftfit.run.track import records_of
+from driftfit.run.result import Track
+from driftfit.run.track import records_of, warn_ungated
 
 
 class Batch(Columns):
@@ -89,7 +91,7 @@ class Batched(Stream):
         Signals and factors are given as to `track`. Where nothing needs the state after every sample (no ``lag``, no
         alarm on a frozen model), the compiled loop of a record does the work, at the cost of a record per sample and
         some 30 us per call; otherwise the samples go through it one by one. The first call compiles the loop, unless
-        `track` has done so before.
+        `track` has done so before. A stream of one theta without a gate warns once of readings that look like codes.
 
         Parameters
         ----------
@@ -130,6 +132,8 @@ class Batched(Stream):
             self._rest(resting)
             if extra:
                 self._set_extra(None, None)
+            if not self._warned and len(self.programs) == 1:
+                self._warned = warn_ungated(Track(self.programs[0], record, Lane(out, self._tile)), "Live.update_many")
         if before is not None and not taken.all():
             out = with_ignored(out, before, np.repeat(taken, rows))
         return Batch(out, rows)
@@ -193,12 +197,13 @@ class Batched(Stream):
         starts, ny = dict(found), self._rows_per_instant
         first = ny * self._samples - left
         for t in sorted({*np.flatnonzero(out["reason"].any(axis=1)).tolist(), *starts}):
-            at = None if time is None else instant(time[t])
+            at, number = None if time is None else instant(time[t]), (first + t) // ny
             for lane in np.flatnonzero(out["reason"][t]).tolist():
                 if out["reason"][t, lane] % SIGNAL != AT_START:
-                    self._note((first + t) // ny, at, out["reason"].item(t, lane), y.item(t, lane), lane)
+                    code, names = out["reason"].item(t, lane), self.programs[lane].signals
+                    self.left_out.add(number if at is None else at, code, y.item(t, lane), names)
             if t in starts:
-                self._note_start((first + t) // ny, at, starts[t])
+                self._note_start(number, at, starts[t])
 
     def _noting(self, step: Any) -> Any:
         """The compiled step behind a gate, which notes what the gate leaves out."""
@@ -206,26 +211,23 @@ class Batched(Stream):
         def noting(tile: Any, y: float, u: Any) -> Any:
             found = step(tile, y, u)
             if not found[3] and (code := self._tile["reason"].item(0, 0)):
-                self._note(self._samples - 1, self._last, code, y)
+                self.left_out.add(
+                    self._samples - 1 if self._last is None else self._last, code, y, self.program.signals
+                )
             return found
 
         return noting
-
-    def _note(self, sample: int, time: Any, code: int, y: float, lane: int = 0, decided: Any = None) -> None:
-        """Count a sample that the gate refused."""
-        self.left_out.add(sample if time is None else time, code, y, self.programs[lane].signals, decided)
 
     def _note_start(self, sample: int, time: Any, first: First) -> None:
         """Count what the gate decided of the first samples, at the present one, in place of what it said before."""
         self.left_out, dt, ny = Tally(), first.known[:, 0, 0], self._rows_per_instant
         begun = sample + 1 - len(first.y) // ny
         times = None if time is None else self._clock.moved(time, dt - np.cumsum(dt[::-1])[::-1])
+        now = sample if time is None else time
         for k, lane in np.argwhere(first.reason).tolist():
-            at = None if times is None else times[k]
-            code, now = first.reason.item(k, lane), sample if time is None else time
-            self._note(
-                begun + k // ny, at, code, first.y.item(k, lane), lane, now if code % SIGNAL == AT_START else None
-            )
+            at, code = begun + k // ny if times is None else times[k], first.reason.item(k, lane)
+            decided = now if code % SIGNAL == AT_START else None
+            self.left_out.add(at, code, first.y.item(k, lane), self.programs[lane].signals, decided)
 
     def _keep(self, y: Array, known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

@@ -40,6 +40,8 @@ Steps = tuple[Array, Array, Array, Array]
 ROWS = "rows"
 """The name of the alarm of outputs that share one theta."""
 
+ONE = 1.0
+"""The factors of a sample that gives none, compared by identity: comparing numbers takes longer."""
 _FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
 
@@ -147,7 +149,7 @@ class Live(Batched):
     ) -> Steps: ...  # fmt: skip
 
     def update(
-        self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0, prob: Any = None
+        self, y: Any, u: Any = LATER, time: Any = None, weight: Any = ONE, drift: Any = ONE, prob: Any = None
     ) -> Any:
         """Process one sample and return (y_hat, e, s, ok), numbers, or arrays (ny,) for several outputs.
 
@@ -161,10 +163,8 @@ class Live(Batched):
         parameter (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its
         changes or joint events at this sample.
         """
-        if prob is not None or type(drift) is not float:
-            return self._update_with_extra(y, u, time, weight, drift, prob)
-        if self._careful or weight != 1.0 or drift != 1.0:
-            return self._sample(y, u, time, weight, drift)
+        if self._careful or weight is not ONE or drift is not ONE or prob is not None:
+            return self._update_known(y, u, time, weight, drift, prob)
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
         if type(u) is not float or self._m != 1:
@@ -207,12 +207,13 @@ class Live(Batched):
         self._interval[0] = resting
         return step
 
-    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: Any, drift: Any, prob: Any) -> Any:
-        """A sample with more known factors than interval, noise and drift."""
-        each = np.ndim(drift) == 1
-        extra = (prob, drift if each else None)
+    def _update_known(self, y: Any, u: Any, time: Any, weight: Any, drift: Any, prob: Any) -> Any:
+        """A sample with known factors, or of a stream that needs more than a call of the compiled step."""
+        each = type(drift) is not float and np.ndim(drift) == 1
+        if not (self._careful or each) and prob is None and weight == drift == 1.0:
+            return self.update(y, u, time)
         if each or prob is not None:
-            self._set_extra(*extra)
+            self._set_extra(prob, drift if each else None)
         try:
             return self._sample(y, u, time, weight, 1.0 if each else float(drift))
         finally:

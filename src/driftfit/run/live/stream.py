@@ -151,7 +151,7 @@ class Stream(Plain, storage.Kept):
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
         self._ignored = self._samples = 0
-        self.left_out = Tally()
+        self.left_out, self._warned = Tally(), False
         self._place: Any = None
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
