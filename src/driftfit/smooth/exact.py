@@ -75,10 +75,14 @@ def spread(walk: Walk, path: Path) -> Path:
 
 
 def mixed(walk: Walk, path: Path) -> Path:
-    """The path with the moments of the mixture; leverages stay those of one Gaussian."""
+    """The path with the moments of the mixture; leverages stay those of one Gaussian.
+
+    Other drifts move its mean as far as they move that of one Gaussian.
+    """
     cov = walk.mixture.cov
     var = np.where(np.isinf(path.var), np.inf, np.einsum("tii->ti", cov))
-    path = path._replace(theta=walk.mixture.theta.copy(), var=var, cov=cov if len(path.cov) else path.cov)
+    moved = np.einsum("k,kti->ti", walk.belief, walk.paths - path.theta) if len(walk.paths) else 0.0
+    path = path._replace(theta=walk.mixture.theta + moved, var=var, cov=cov if len(path.cov) else path.cov)
     error = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan)) * walk.residual(path.theta)
     return path._replace(rho=error / np.where(path.c > 0.0, path.c, 1.0) if len(path.c) else path.rho)
 

@@ -20,6 +20,7 @@ samples; the filter runs again from checkpoints.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -163,8 +164,7 @@ class Mixture(NamedTuple):
         """(T,): how many components the next smoother of the record should be allowed."""
         more = self.kept.copy()
         for t in np.flatnonzero(self.uneven):
-            near = slice(max(t - NEAR, 0), t + NEAR)
-            more[near] = MOST_COMPONENTS
+            more[max(t - NEAR, 0) : t + NEAR] = MOST_COMPONENTS
         return more
 
 
@@ -174,9 +174,9 @@ class Samples(NamedTuple):
     phi: Array
     y: Array
     r: Array
+    keep: Array
     table: Array
     sizes: Array
-    keep: Array
 
 
 @shared
@@ -300,7 +300,7 @@ def forwards(
     """The filter through a block of samples. With ``store`` it stores its components after each sample, and the levels
     before and after it.
     """
-    phi, y, r, table, sizes, keep = samples
+    phi, y, r, keep, table, sizes = samples
     K = now.many[0]
     stored.level[0] = now.level[0]
     for t in range(len(y)):
@@ -320,7 +320,7 @@ def backwards(
     samples: Samples, moves: Moves, noises: Noises, now: Filter, stored: Filter, room: Room, last: bool, found: Mixture
 ) -> None:  # fmt: skip
     """The likelihood through a block, and where it meets the filter; ``last``: the record ends with the block."""
-    phi, y, r, table, sizes, keep = samples
+    phi, y, r, keep, table, sizes = samples
     K, n, wide = now.many[0], phi.shape[1], found.cov.shape[2]
     out = np.zeros((n + 3, n))
     for t in range(len(y) - 1, -1, -1):
@@ -330,7 +330,7 @@ def backwards(
         else:
             C = grow(K, now, moves, moves.log_prob[table[t]], sizes[t], room)
         X, facts = stored.A[t, : stored.many[t]], stored.facts[t]
-        total = meet(X, facts, C, moves, sizes[t], room, out, found.events[t])
+        total = meet(X, facts, C, moves, sizes[min(t, len(sizes) - 1)], room, out, found.events[t])
         found.evidence[t] = stored.level[t + 1] + now.level[0] + total
         found.theta[t], found.shift[t], found.shift_var[t] = out[0], out[n + 1], out[n + 2]
         for i in range(n):
@@ -344,22 +344,33 @@ def backwards(
     now.many[0] = K
 
 
-def smooth(problem: Problem | Passes, covariances: bool = False, kept: Array | None = None) -> Mixture:
+def smooth(problem: Problem, covariances: bool = False, kept: Array | None = None) -> Mixture:
     """Smooth a record; with ``covariances`` of every sample, and otherwise variances.
 
-    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. The filter
-    of `Passes` may be done. Where the evidence is not constant, more components are allowed, up to `MOST_COMPONENTS`
-    (`Mixture.needed`).
+    ``kept`` (T,) says how many components another smoother of the record needed, with which this one begins. Where the
+    evidence is not constant, `MOST_COMPONENTS` are allowed (`Mixture.needed`).
     """
-    if isinstance(problem, Passes):
-        passes = problem
-    else:
-        passes = Passes(problem, np.full(len(problem.y), ROOMY) if kept is None else kept)
+    needed = np.full(len(problem.y), ROOMY) if kept is None else kept
     while True:
-        found = passes.smoothed(covariances)
-        if np.array_equal(found.needed, found.kept):
+        found = Passes(problem, needed).smoothed(covariances)
+        needed = found.needed
+        if np.array_equal(needed, found.kept):
             return found
-        passes = Passes(passes.problem, found.needed)
+
+
+def average(w: Array, found: Sequence[Mixture]) -> Mixture:
+    """The mixture of mixtures with shares w (K,) that sum to 1; evidence and components are those of the first."""
+    theta = np.asarray(sum(share * one.theta for share, one in zip(w, found, strict=True)))
+    events = np.asarray(sum(share * one.events for share, one in zip(w, found, strict=True)))
+    moved = w[:, None] * np.array([1.0 - one.events[:, 0] for one in found])
+    moved = (moved / np.maximum(moved.sum(axis=0), np.finfo(float).tiny))[:, :, None]
+    shift = np.asarray(sum(share * one.shift for share, one in zip(moved, found, strict=True)))
+    cov, shift_var = np.zeros_like(found[0].cov), np.zeros_like(shift)
+    for share, given, one in zip(w, moved, found, strict=True):
+        away = one.theta - theta
+        cov += share * (one.cov + (away**2 if cov.ndim == 2 else away[:, :, None] * away[:, None, :]))
+        shift_var += given * (one.shift_var + (one.shift - shift) ** 2)
+    return found[0]._replace(theta=theta, cov=cov, events=events, shift=shift, shift_var=shift_var)
 
 
 def filtered(problem: Problem, keep: int) -> tuple[float, float, float]:
@@ -386,10 +397,7 @@ class Passes:
         self.ways = [problem.alternatives.moves(self.scale, back) for back in (False, True)]
         children = max(int(np.diff(way.begin).max()) for way in self.ways) * len(noises.kind)
         self.room = room_for(n, most, children)
-        scaled, now, after = phi / self.scale, np.arange(T), np.append(np.arange(1, T), 0)
-        self.samples = [
-            Samples(scaled, problem.y, r, problem.table[at], problem.sizes[at], keep) for at in (now, after)
-        ]
+        self.samples = Samples(phi / self.scale, problem.y, r, keep, problem.table, problem.sizes)
         unit = VAGUE / np.sqrt(np.median(r[used])) if used.any() else VAGUE
         end, rows = unit * np.eye(n, n + 1), problem.start / np.append(self.scale, 1.0)
         self.ahead, self.behind = (
@@ -407,8 +415,10 @@ class Passes:
             np.zeros(0),
         )  # fmt: skip
 
-    def _block(self, a: int, which: int) -> Samples:
-        return Samples(*(values[a : a + BLOCK] for values in self.samples[which]))
+    def _block(self, a: int, later: int) -> Samples:
+        """The samples from a on, with the moves so many samples later."""
+        starts = (a, a, a, a, a + later, a + later)
+        return Samples(*(values[b : b + BLOCK] for values, b in zip(self.samples, starts, strict=True)))
 
     def _forward(self, a: int, store: bool) -> None:
         forwards(self._block(a, 0), self.ways[0], self.problem.noises, self.ahead, self.stored, self.room, store)

@@ -13,7 +13,7 @@ found in three steps:
     2. with the expected squares of its jumps as known drift the problem has one Gaussian, whose likelihood costs a
        hundredth (`driftfit.smooth.solvers.elimination`): climb by half powers of ten, for all parameters or one group,
        and average over the ratios that were tried, of which the smallest moves the path by less than its error;
-    3. the root of the drift of the path is the average over `SCALES` of these ratios, weighted by the evidence.
+    3. the drift of the path is the average over `SCALES` of these ratios, weighted by the evidence.
 
 Variances grow by the spread of the paths of step 2: a slow walk can look as if nothing moved. Slopes that walk are
 another model of the same record (`driftfit.smooth.solvers.slopes`) and are averaged likewise; where they are more
@@ -86,19 +86,23 @@ def averaged(walk: Walk, times: tuple[Array, Array], trend: Array, groups: Group
     unit = r / np.where(power > 0.0, power, 1.0)
     found = times[1] * (times[0].sum() / times[1].sum())
     plain, weighed = (hypotheses(walk, time, unit, groups) for time in (times[0], found))
+    likeliest: list[tuple[float, Passes]] = []
 
     @cache
-    def tried(level: int, time: int) -> tuple[Passes, float]:
+    def tried(at: Point) -> float:
+        level, time = at
         problem = drifting((plain, weighed)[time], np.diag(np.sqrt(LEVELS[level] * unit)))
         passes = Passes(problem, np.full(T, FEW))
-        return passes, passes.forward() - time * T / SHARE
+        value = float(passes.forward() - time * T / SHARE)
+        likeliest[:] = [max([*likeliest, (value, passes)], key=lambda one: one[0])]
+        return value
 
     def near(at: Point) -> list[Point]:
         return [(level, at[1]) for level in (at[0] - 1, at[0] + 1) if at[1] <= level < len(LEVELS)]
 
-    level, _ = summit(lambda at: tried(*at)[1], (1, 0), near)
-    at = summit(lambda at: tried(*at)[1], (level, 0), lambda at: [*near(at), (max(level, 1), 1)])
-    passes = tried(*at)[0]
+    level, _ = best = summit(tried, (1, 0), near)
+    summit(tried, best, lambda at: [*near(at), (max(level, 1), 1)])
+    passes = likeliest[0][1]
     first, problem = passes.smoothed(False), passes.problem
     jumps = (1.0 - first.events[:, :1]) * (first.shift**2 + first.shift_var)
     time = problem.sizes[:, :1] ** 2
@@ -206,7 +210,6 @@ def climbed(walk: Walk, time: Array, jumps: Array, unit: Array, groups: Groups) 
 
 
 def of_scales(problem: Problem, q: Array, keep: Array) -> Mixture:
-    """The mixture with the drift q (n,) times a scale, whose root is the average over `SCALES`."""
-    roots = [np.diag(np.sqrt(scale * q)) for scale in SCALES]
-    logs = [Passes(drifting(problem, root), np.full(len(keep), FEW)).forward() for root in roots]
-    return mixture.smooth(drifting(problem, np.einsum("k,kij->ij", shares(np.array(logs)), roots)), True, keep)
+    """The mixture with the drift q (n,) times the average of `SCALES`."""
+    logs = np.array([mixture.filtered(drifting(problem, np.diag(np.sqrt(scale * q))), FEW)[0] for scale in SCALES])
+    return mixture.smooth(drifting(problem, np.diag(np.sqrt(shares(logs) @ SCALES * q))), True, keep)

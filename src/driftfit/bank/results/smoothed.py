@@ -10,15 +10,14 @@ or reset are no random walk, and are refused.
 
 The drift of `Bank()` is a guess. The covariance that it gives parameter i is multiplied by a factor f_i, one of
 `FACTORS`: none, or a power of ten. They are found by climbing from the best that is common to all parameters, one step
-for all or for one of them at a time. The drift is the average over all that were tried, weighted by the
-evidence of all hypotheses. What is unknown of the noise is that of the record:
+for all or for one of them at a time. The path is the average of two, with the mean of the smaller and of the larger
+half of those that were tried, weighted by the evidence of all hypotheses. What is unknown of the noise is the record's:
 
     r       at which the expected sum of e^2 / s is the number of samples
     spikes  their expected share, with a prior that counts for `RARITY` samples; without them they would be two jumps
 
 Source: Kitagawa (1994) for the smoother; Hoeting, Madigan, Raftery and Volinsky (1999) for averaging over models by
-their likelihood. Cost: 30 us per sample for two parameters and changes; for `Bank()` some fifteen filters of `FEW`
-components.
+their likelihood. Cost: 20 us per sample for two parameters and changes, and some fifteen filters for `Bank()`.
 """
 
 from __future__ import annotations
@@ -77,16 +76,23 @@ class SmoothedMixture(Bands):
         self.run, self.names, self.time = run, run.names, run.time
         bank: Any = run.tracker
         problem = problem_of(run, faults)
-        self._problem = settled(bank, problem)
-        self.mixture = mixture.smooth(self._problem)
+        self._weighed = hypotheses_of(bank, problem)
+        found = self._smoothed(None)
+        self._weights = np.array([weight for weight, _ in self._weighed])
+        self.mixture = mixture.average(self._weights, found)
         self.prior = problem.alternatives.first()[problem.table]
         self.theta, self.change_prob, self.shift = self.mixture.theta, self.mixture.events, self.mixture.shift
         self.shift_std = np.sqrt(self.mixture.shift_var)
         self.moved = self.change_prob[:, 1:] @ self.mixture.moves[1:]
         used = int(np.argmax(np.isfinite(problem.r)))
-        scale = self._problem.r[used] / problem.r[used]
-        self.r = float(noise_variance(bank, run) * (scale if scale > 0.0 else 1.0))
-        self.uneven = self.mixture.uneven
+        scales = np.array([one.r[used] / problem.r[used] for _, one in self._weighed])
+        self.r = float(noise_variance(bank, run) * np.sum(self._weights * np.where(scales > 0.0, scales, 1.0)))
+        self.uneven = np.any([one.uneven for one in found], axis=0)
+
+    def _smoothed(self, kept: Array | None, covariances: bool = False) -> list[mixture.Mixture]:
+        """The record with each of the drifts; as many components are kept as the likeliest of them needed."""
+        first = mixture.smooth(self._weighed[0][1], covariances, kept)
+        return [first, *(mixture.smooth(one, covariances, first.kept) for _, one in self._weighed[1:])]
 
     def __rich_console__(self, console: Any, options: Any) -> Any:
         yield path_table("Smoothed over all hypotheses", self.names, self.theta, self.std)
@@ -100,15 +106,15 @@ class SmoothedMixture(Bands):
     @cached_property
     def covs(self) -> Array:
         """(T, n, n); computed again, with n n numbers for each sample."""
-        return mixture.smooth(self._problem, True, self.mixture.kept).cov
+        return mixture.average(self._weights, self._smoothed(self.mixture.kept, covariances=True)).cov
 
 
-def settled(bank: Bank, problem: Problem) -> Problem:
-    """The problem with the drift and the noise of the record, unless they are given."""
+def hypotheses_of(bank: Bank, problem: Problem) -> list[tuple[float, Problem]]:
+    """Problems with weights that sum to 1: one if drift and noise are given."""
     free = bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None
     if bank.changes is None:
         return averaged(problem, problem.alternatives.roots[0], free, bank.gated)
-    return matched(problem, bank.gated) if free else problem
+    return [(1.0, matched(problem, bank.gated) if free else problem)]
 
 
 def problem_of(run: Track, faults: list[Event], kinds: Array | None = None) -> Problem:
@@ -245,8 +251,8 @@ def matched(problem: Problem, spikes: bool) -> Problem:
     return problem
 
 
-def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> Problem:
-    """The problem with the average of the drifts, and of the noise variances, weighted by their evidence.
+def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> list[tuple[float, Problem]]:
+    """Problems with the average of the smaller and of the larger likely drifts, and their shares, which sum to 1.
 
     ``drift`` (n, n) has the columns g_i; the first root of the problem is that of the drift. ``free``: the noise
     variance is the record's.
@@ -275,10 +281,14 @@ def averaged(problem: Problem, drift: Array, free: bool, spikes: bool) -> Proble
     top = len(FACTORS) - 1
     common = max(((level,) * n for level in range(0, top + 1, 2)), key=value)
     summit(value, common, lambda at: neighbours(at, [[i] for i in range(n)], top))
-    logs, scales = np.array([*known.values()]).T
-    p = shares(logs)
-    factors = p @ (FACTORS[np.array([*known])] * scales[:, None])
-    return scaled(of(factors / (p @ scales)), float(p @ scales))
+    logs, noises = np.array([*known.values()]).T
+    p, factors = shares(logs), FACTORS[np.array([*known])] * noises[:, None]
+    order = np.argsort(factors.sum(axis=1))
+    above = np.cumsum(p[order]) - 0.5 * p[order] > 0.5
+    means = [
+        p[half] @ np.column_stack([np.ones_like(p), noises, factors])[half] for half in (order[~above], order[above])
+    ]
+    return [(share, scaled(of(np.array(mean) / c), c / share)) for share, c, *mean in means if share > 0.0]
 
 
 def noise_variance(bank: Bank, run: Track) -> float:
