@@ -1,7 +1,7 @@
 """Time and memory of `driftfit identify` with its page on 10,000 rows and six inputs, as a new user meets them.
 
 The command runs twice in a process of its own: with an empty cache of compiled code, and again. "seconds" are those of
-the clock, "processor" those of all its processes together over the number of cores, which other programs change less;
+the clock, "processor" those of all its processes together, which other programs change less: two share the first call.
 "memory" is the peak of the largest process. The code of Python itself is compiled before, as by an installation.
 
 Run: python benchmarks/identify_time.py
@@ -20,8 +20,6 @@ from time import perf_counter
 import numpy as np
 import polars as pl
 from scipy import signal
-
-from driftfit.run.parallel_lanes import cores
 
 ROWS, INPUTS = 10_000, 6
 
@@ -52,7 +50,7 @@ def main() -> None:
             subprocess.run([*command, "--quiet"], cwd=folder, env=env, check=True, stdout=subprocess.DEVNULL)
             after, seconds = resource.getrusage(resource.RUSAGE_CHILDREN), perf_counter() - began
             used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-            print(f"{cache:14}{seconds:9.1f}{used / min(cores(), 2):11.1f}{after.ru_maxrss / 1024:12.0f}", flush=True)
+            print(f"{cache:14}{seconds:9.1f}{used:11.1f}{after.ru_maxrss / 1024:12.0f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -3,13 +3,14 @@
 With e_1 and e_2 the errors of the tracker and of recursive least squares on the same regressors, and v the mean square
 of the better so far,
 
-    p_i = exp(-e_i^2 / 2 v),   w_t = s + (1 - 2 s) w_(t-1) p_1 / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),
+    p_i = exp(-e_i^2 / 20 v),   w_t = s + (1 - 2 s) w_(t-1) p_1 / (w_(t-1) p_1 + (1 - w_(t-1)) p_2),
     y_hat = w y_hat_1 + (1 - w) y_hat_2
 
-so that a record of constants costs no more than a few nats, and a change is followed (Herbster and Warmuth, 1998). With
-one v for both, they are weighed by what is reported, squared errors. The bound needs bounded predictions, so each stays
-within the outputs so far, widened by their range. All predictions are made before the sample; those h steps ahead are
-given the inputs, and weighed by what is known then.
+so that a record of constants costs little, and a change is followed (Herbster and Warmuth, 1998). With one v for both,
+they are weighed by what is reported, squared errors. Of errors up to B these are mixed at the rate 1 / 2 B^2 (Haussler,
+Kivinen and Warmuth, 1998), and B^2 = 10 v is three deviations; at 1 / 2 v a single large error decided. The bound needs
+bounded predictions, so each stays within the outputs so far, widened by their range. All predictions are made before
+the sample; those h steps ahead are given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def mixed(errors: Array, h: int) -> Array:
     before, count = np.cumsum(squares, axis=1) - squares, np.cumsum(known) - known
     v = np.maximum(before.min(axis=0) / np.maximum(count, 1), SMALL)
     with np.errstate(over="ignore"):
-        worse = np.exp(np.where(count > LEAST, (squares[0] - squares[1]) / (2.0 * v), 0.0))
+        worse = np.exp(np.where(count > LEAST, (squares[0] - squares[1]) / (20.0 * v), 0.0))
     weights = [0.5] * h
     for ratio in worse.tolist():
         w = weights[-1]

@@ -109,7 +109,7 @@ def others(answer: Identification) -> list[str]:
 
 def curve(answer: Identification) -> str:
     """What the curve is made of."""
-    first, rest = ", ".join(answer.cause.products[:3]), len(answer.cause.products) - 3
+    first, rest = ", ".join(answer.cause.products[:2]), len(answer.cause.products) - 2
     nats = f"{answer.cause.curve[0]:.0f} nats over a straight line"
     return f"the effects depend on the working point ({first}{f' and {rest} more' if rest > 0 else ''}; {nats})"
 
