@@ -148,7 +148,8 @@ def lags_of(v: Array, most: int, ok: Array | None = None, season: int = SEASON) 
         return NONE
     v = np.clip(v, -limit, limit) if limit > 0.0 else v
     rows = v[at[:, None] - np.append(np.arange(1, longest + 1), 0)]
-    R, most, price = np.linalg.qr(rows, mode="r"), min(most, longest), np.log(len(at) + longest)
+    R: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    most, price = min(most, longest), np.log(len(at) + longest)
     left = np.maximum(np.cumsum(R[::-1, -1] ** 2)[::-1][: most + 1], SINGULAR * np.sum(R[:, -1] ** 2) + SMALL)
     order = int(np.argmin(len(at) * np.log(left) + price * np.arange(most + 1)))
     rest = R[order:, most:]  # what the first lags do not explain

@@ -46,4 +46,4 @@ def switches(names: Sequence[str], y: Array, phi: Array, columns: Sequence[list[
         own = [N * np.log(left(phi[rows][:, one], y[rows])) + len(one) * np.log(N) for one in columns]
         best.append(names[int(np.argmin(own))])
     each = zip(at[breaks].tolist(), spans, pairwise(best), strict=True)
-    return [Switch(date, *span, before, after) for date, span, (before, after) in each if before != after]
+    return [Switch(date, first, last, one, other) for date, (first, last), (one, other) in each if one != other]
