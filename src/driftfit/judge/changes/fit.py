@@ -179,13 +179,17 @@ def rise(N: int, ends: tuple[int, int]) -> Array:
     return np.asarray(np.clip((np.arange(N) - ends[0]) / max(ends[1] - ends[0], 1), 0.0, 1.0))
 
 
-def ramp(X: Array, y: Array, noise: tuple[Array, Array, Array], moves: Sequence[int], corners: int) -> tuple[int, int]:
-    """The ends of the best gradual change of some of the columns X (N, n), on straight lines between any two of so many
-    corners, for noise of (lags, ar, g): a rise is the difference of two hinges."""
+def corners(N: int, most: int) -> Array:
+    """Rows at the ends of so many cells, or fewer."""
+    return np.unique(np.linspace(0, N - 1, min(most, N // 8) + 1).astype(int))
+
+
+def ramp(X: Array, y: Array, noise: tuple[Array, Array, Array], moves: Sequence[int], places: Array) -> tuple[int, int]:
+    """The ends of the best gradual change of some of the columns X (N, n), on a straight line between any two of some
+    places, for noise of (lags, ar, g): a rise is the difference of two hinges."""
     N, J = len(y), len(moves)
     Z, z = white_rows(X, y, *noise)
     Q = np.linalg.qr(Z)[0]
-    places = np.unique(np.linspace(0, N - 1, min(corners, N // 8) + 1).astype(int))
     hinges = np.maximum(np.arange(N)[:, None] - places, 0.0)[:, :, None] * X[:, None, moves]
     white = white_rows(hinges.reshape(N, -1), y, *noise)[0]
     white -= Q @ (Q.T @ white)
@@ -236,7 +240,7 @@ def together(
     assert best is not None
     if order is None:
         white = NONE, np.zeros(0), g
-        rows = np.hstack([X, X * rise(N, ramp(X, y, white, range(n), CORNERS))[:, None]])
+        rows = np.hstack([X, X * rise(N, ramp(X, y, white, range(n), corners(N, CORNERS)))[:, None]])
         v = y - rows @ coefficients(rows * g[:, None], y * g)
         lags = lags_of(v * g, orders)
         ar = regressed(v, g, lags)

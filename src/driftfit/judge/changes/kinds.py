@@ -26,13 +26,13 @@ import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.changes.dates import Dated
-from driftfit.judge.changes.fit import coefficients, left, order_of, ramp, rise, split, white_rows
+from driftfit.judge.changes.fit import coefficients, corners, left, order_of, ramp, rise, split, white_rows
 from driftfit.judge.changes.null import Model
 from driftfit.judge.changes.which import Which
 from driftfit.judge.statistics.robust import invertible
 
-CORNERS = 24
-"""Cells at whose ends a gradual change may begin or end."""
+CORNERS, FINER = 24, 8
+"""Cells at whose ends a gradual change may begin or end, and the parts of a cell in which these are then moved."""
 STEPS = 10.0 ** np.arange(-7.0, 0.5, 0.5)
 """Variances of a step of the walk, as shares of the noise."""
 UNIT_ROOT = 14.1
@@ -129,7 +129,12 @@ def kind(model: Model, found: Dated, changes: Which, moving: tuple[int, ...]) ->
     slow, ends, path, tried = moves, (0, N - 1), np.zeros((N, 0)), [moves]
     while tried:
         for own in tried:
-            at = ramp(phi, model.y, (lags, found.ar, g), own, CORNERS)
+            noise, places = (lags, found.ar, g), corners(N, CORNERS)
+            near = [
+                end + places[1] * np.arange(-FINER, FINER + 1) // FINER
+                for end in ramp(phi, model.y, noise, own, places)
+            ]
+            at = ramp(phi, model.y, noise, own, np.unique(np.clip(near, 0, N - 1)))
             shape = rise(N, at)[:, None]
             both = np.hstack([Z, white_rows(shape * phi[:, own], model.y, lags, found.ar, g)[0]])
             score = M * np.log(left(both, z, model.floor)) + (n + len(own) + DATE * 2) * price
