@@ -7,10 +7,10 @@ of the better so far,
     y_hat = w y_hat_1 + (1 - w) y_hat_2
 
 so that a record of constants costs little, and a change is followed (Herbster and Warmuth, 1998). With one v for both,
-they are weighed by what is reported, squared errors. Of errors up to B these are mixed at the rate 1 / 2 B^2 (Haussler,
-Kivinen and Warmuth, 1998), and B^2 = 10 v is three deviations; at 1 / 2 v a single large error decided. The bound needs
-bounded predictions, so each stays within the outputs so far, widened by their range. All predictions are made before
-the sample; those h steps ahead are given the inputs, and weighed by what is known then.
+they are weighed by what is reported, squared errors. exp(-e^2 / 2 B^2) is concave in predictions with errors up to B,
+so the average of both may be used (Kivinen and Warmuth, 1999); B^2 = 10 v is three deviations. Errors need a bound, so
+each prediction stays within the outputs so far, widened by their range. All predictions are made before the sample;
+those h steps ahead are given the inputs, and weighed by what is known then.
 """
 
 from __future__ import annotations
