@@ -56,12 +56,12 @@ def test_a_sample_and_the_interaction_against_matrices(groups):
 
 def test_the_table_of_modes():
     modes = table(4, None)
-    assert len(modes["ratio"]) == 14 + 4 * 4
+    assert len(modes["ratio"]) == 15 + 4 * 4
     assert modes["start"].sum() == pytest.approx(1.0)
     assert modes["arrive"][modes["ratio"] >= 1.0].sum() == pytest.approx(2e-3)
-    assert modes["alone"].tolist() == [[14, 18, 22, 26], [18, 22, 26, 30]]
+    assert modes["alone"].tolist() == [[15, 19, 23, 27], [19, 23, 27, 31]]
     assert (modes["ratio"][: len(COMMON)] == COMMON).all()
-    assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 14
+    assert len(table(9, None)["ratio"]) == len(table(1, None)["ratio"]) == 15
 
 
 def test_a_pass_of_scores_against_matrices():

@@ -6,7 +6,7 @@
 | ladder | Q, in units of noise variance over input power | rho |
 |---|---|---|
 | common | 1 / c_i, c_i = mean phi_i^2; inputs far from 0 drift about their means | 0, 1e-4 .. .01, .04, .2, 1, J |
-| trend | as common; theta moves on along its slope | .01, .1 |
+| trend | as common; theta moves on along its slope | .001, .01, .1 |
 | learned | the drift covariance found by a backward pass of scores over the last 40 samples | .001, .01, .1, 1 |
 | single i | 1 / c_i for parameter i alone (two to eight parameters), or for those of a group | .003, .05, 1, J |
 
@@ -33,7 +33,7 @@ Use it if nothing is known; if q and r are known, `Kalman` is as good and far ch
 in a few hundred samples; ``groups`` specifies it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the modes and what is learned are ours. Cost per
-sample: O(K n^2) for K modes; without groups K = 14 + 4 n for two to eight parameters, and 14 for more.
+sample: O(K n^2) for K modes; without groups K = 15 + 4 n for two to eight parameters, and 15 for more.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ from driftfit.trackers.forms.covariance import LEFT
 
 COMMON = (0.0, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 1000.0)
 JUMPS = max(COMMON)
-TREND = (0.01, 0.1)
+TREND = (1e-3, 1e-2, 0.1)
 LEARNED = (1e-3, 1e-2, 0.1, 1.0)
 ALONE = (0.003, 0.05, 1.0, JUMPS)
 """Drift ratios of the ladders; that of jumps lasts for a few samples."""
