@@ -169,8 +169,7 @@ class TrackerSteps(NamedTuple):
     (`driftfit.engine.tracker_part`); with ``reads_model`` they see those of the model too. ``outlined`` steps are
     compiled apart from the drivers, which call them (`driftfit.engine.outlined`): for trackers that take so long that a
     call costs nothing; ``start`` always is. With ``learns_scale`` s.scale is the noise variance that the tracker
-    estimates, which a gate keeps above that of rounding. Without a gate ``note(s, l, s, l)`` precedes the
-    correction.
+    estimates, which a gate keeps above that of rounding. Without a gate ``note(s, l, s, l)`` takes its place.
     """
 
     predict: Step

@@ -271,8 +271,7 @@ class Outputs(KeyedResults, OfRecord):
 
     @cached_property
     def _start_decided(self) -> Any:
-        reason = None if self.programs[0].gate is None else self.in_rows("reason")
-        return decided_record(self.programs, self.record, [self._starts[j] for j in sorted(self._starts)], reason)
+        return decided_record(self.programs, self.record, self._starts, self.in_rows)
 
     def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
         """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
@@ -310,7 +309,7 @@ class Outputs(KeyedResults, OfRecord):
             units |= {name: units[source] for name, source in held if source in units}
             u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
             if self.programs[j].gate is not None:
-                used, start = self.decided.ok[:, j], self._start_decided[2] if self._start_decided else 0
+                used, start = self.decided.ok[:, j], self._start_decided
                 left = left_out_of(self.programs[j], lane.written("reason"), y, used, start)
                 y, noise = left.applied(y, known.noise)
                 known = known.changed(noise=noise)

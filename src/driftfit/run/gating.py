@@ -87,16 +87,16 @@ def judging(gate: Gate, model: Model, tracker: Tracker, steps: tuple[ModelSteps,
     return gate_step(gate, own.ages, own.refuse, implicit, lends, foresee, rows and (rows_of, rows, 1 + model.m))
 
 
-def left_out_of(program: Any, decided: Array, y: Array, ok: Array, start: int) -> LeftOut:
+def left_out_of(program: Any, decided: Array, y: Array, ok: Array, start: Any) -> LeftOut:
     """The decisions in a run of a program, from what its gate stored for every sample (T,), its readings, which samples
-    were used once all was decided, and the one at which the first were."""
+    were used once all was decided, and what `decided_record` found."""
     sample, names, ny = np.flatnonzero(decided), program.signals, len(program.rows) or 1
     signal, code = np.divmod(decided[sample].astype(int), SIGNAL)
     refused = sample[signal % (len(names) // ny) == 0]
     after = (sample[:, None] + np.arange(program.model.steps.ages + 1)).ravel()
     after = np.setdiff1d(after[after < len(y)], refused)
     unused = after[~ok[after] & np.isfinite(y[after])]
-    when = np.where(code == AT_START, start, sample) // ny
+    when = np.where(code == AT_START, start[2] if start else 0, sample) // ny
     return LeftOut(sample // ny, code, y[sample], np.array(names)[signal], when, refused, unused)
 
 

@@ -7,7 +7,7 @@ of a record are many, in files too: those with equal fields are stored together.
 from __future__ import annotations
 
 import os
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from os import PathLike
 from typing import Any, NamedTuple, Self
@@ -102,18 +102,18 @@ def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
 
 
 def decided_record(
-    programs: Sequence[Program], record: Record, starts: Sequence[State], reason: Array | None
+    programs: Sequence[Program], record: Record, starts: Mapping[int, State], written: Callable[[str], Array]
 ) -> tuple[Record, Sequence[State], int] | None:
     """(the record without the codes that a gate finds among its first samples, the fields with which its lanes then
     begin, the sample at which it finds them), given the programs of the lanes, the fields with which they began and
-    what the gate said of every sample; None if it found none.
+    what they wrote of every sample; None if it found none.
     """
-    if reason is None or AT_START not in reason % SIGNAL:
+    if programs[0].gate is None or AT_START not in written("reason") % SIGNAL:
         return None
     found: list[tuple[int, First]] = []
-    tile = tile_of(programs, starts)
+    tile = tile_of(programs, states := [starts.get(j, {}) for j in range(len(programs))])
     programs[0].drivers().run(tile, *lanes_of(record), programs[0].written(tile, len(record)), found_too=found)
-    begun = [{**start, "gate_decided": np.array(1)} for start in starts or [{}] * len(programs)]
+    begun = [{**state, "gate_decided": np.array(1)} for state in states]
     return without_codes(record, *found[0]), begun, found[0][0]
 
 

@@ -265,13 +265,12 @@ class Track(Plain, OfRecord):
         """What the gate decided of samples that it did not use as they are; empty without a gate."""
         if self.program.gate is None:
             return self._left_out
-        used, start = self.decided.in_rows("ok") > 0.0, self._start_decided[2] if self._start_decided else 0
-        return left_out_of(self.program, self.in_rows("reason"), self.record.y, used, start)
+        used = self.decided.in_rows("ok") > 0.0
+        return left_out_of(self.program, self.in_rows("reason"), self.record.y, used, self._start_decided)
 
     @cached_property
     def _start_decided(self) -> Any:
-        reason = None if self.program.gate is None else self.in_rows("reason")
-        return decided_record([self.program], self.record, [self.start or {}], reason)
+        return decided_record([self.program], self.record, {0: self.start or {}}, self.in_rows)
 
     @cached_property
     def decided(self) -> Track:

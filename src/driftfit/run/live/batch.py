@@ -212,7 +212,7 @@ class Batched(Stream):
             found = step(tile, y, u)
             if not found[3] and (code := self._tile["reason"].item(0, 0)):
                 self.left_out.add(
-                    self._samples - 1 if self._last is None else self._last, code, y, self.program.signals
+                    self._samples - 1 if self._last is None else self._last, code, y, self.programs[0].signals
                 )
             return found
 

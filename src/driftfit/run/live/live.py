@@ -26,7 +26,7 @@ from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.batch import Batch, Batched, LiveOutput
 from driftfit.run.live.fixed_lag import FixedLag, Window
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.live.stream import HELD, INPUT, LATER, NOTHING, Factors
+from driftfit.run.live.stream import HELD, INPUT, LATER, NOTHING, ORDINARY, Factors
 from driftfit.run.program import Program
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
@@ -40,7 +40,7 @@ Steps = tuple[Array, Array, Array, Array]
 ROWS = "rows"
 """The name of the alarm of outputs that share one theta."""
 
-ONE = 1.0
+_, ONE, _ = ORDINARY
 """The factors of a sample that gives none, compared by identity: comparing numbers takes longer."""
 _FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
