@@ -55,14 +55,16 @@ def test_the_predictive_density_is_the_integral_over_the_noise_variance():
     assert reported(run, "evidence")[0] == pytest.approx(math.log(value), abs=1e-6)
 
 
-def test_evidence_with_unknown_noise_knows_no_scale():
-    a = 7.0
-    one = track(Regression(N), Bank(changes(), unknown(), p0=2.0), Y, U)
-    wide = [Change(q * a * a, prob=p) for q, p in zip(Q, PROBS, strict=True)]
-    bank = Bank(wide, [Sensor.nominal(guess=0.09 * a * a)], p0=2.0 * a * a)
-    other = track(Regression(N), bank, a * Y, U)
-    np.testing.assert_allclose(other.theta, a * one.theta, atol=1e-10 * a)
-    np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(a), atol=1e-10)
+@pytest.mark.parametrize(("noise", "reduce"), [("guess", None), ("r", GPB(2))])
+def test_evidence_changes_by_the_logarithm_of_the_scale(noise, reduce):
+    def run(a):
+        wide = [Change(q * a * a, prob=p) for q, p in zip(Q, PROBS, strict=True)]
+        sensors = [Sensor.nominal(**{noise: 0.09 * a * a})]
+        return track(Regression(N), Bank(wide, sensors, reduce=reduce, p0=2.0 * a * a), a * Y, U)
+
+    one, other = run(1.0), run(7.0)
+    np.testing.assert_allclose(other.theta, 7.0 * one.theta, atol=1e-9)
+    np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(7.0), atol=1e-10)
 
 
 def test_lags_that_leaves_keep_know_no_scale_either():
@@ -84,15 +86,6 @@ def test_lags_that_leaves_keep_know_no_scale_either():
         other = run(a)
         np.testing.assert_allclose(other.theta, one.theta * [1.0, a], rtol=1e-7, atol=1e-9 * a)
         assert other.loglik + np.isfinite(other.log_density).sum() * math.log(a) == pytest.approx(one.loglik, abs=1e-7)
-
-
-def test_scale_with_known_noise():
-    a = 5.0
-    one = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=GPB(2), p0=2.0), Y, U)
-    wide = [Change(q * a * a, prob=p) for q, p in zip(Q, PROBS, strict=True)]
-    other = track(Regression(N), Bank(wide, [Sensor.nominal(R * a * a)], reduce=GPB(2), p0=2.0 * a * a), a * Y, U)
-    np.testing.assert_allclose(other.theta, a * one.theta, atol=1e-10)
-    np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(a), atol=1e-10)
 
 
 @pytest.mark.parametrize("reduce", [GPB(2), IMM()], ids=str)

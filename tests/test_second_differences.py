@@ -164,15 +164,6 @@ def test_mu_is_found_and_the_path_is_better_than_with_first_differences():
     assert np.median(better) < 0.5
 
 
-def test_bands_cover_when_the_slope_walks():
-    hits = []
-    for seed in range(20):
-        y, phi, theta = bent(seed, 200, 0.02)
-        low, high = track(TWO, FLS((0.3 / 0.02) ** 2, differences=2), y, phi).smooth().band()
-        hits.append((low <= theta) & (theta <= high))
-    assert 0.92 <= np.mean(hits) <= 0.98
-
-
 def test_order_frontier_huber_files_and_lags(tmp_path):
     y, phi, _ = bent(3, 80, 0.05)
     run = track(TWO, FLS(40.0, differences=2), y, phi)

@@ -330,14 +330,18 @@ def test_who_cannot_be_smoothed_says_so():
         track(Regression(2), FLS(1.0), y, phi).smooth(keep="all")
 
 
-def test_bands_cover_when_the_model_is_true():
+@pytest.mark.parametrize(("differences", "step", "noise"), [(1, 0.1, 0.5), (2, 0.02, 0.3)])
+def test_bands_cover_when_the_model_is_true(differences, step, noise):
     rng = np.random.default_rng(11)
     L, hits = 200, []
     for _ in range(30):
-        theta = np.cumsum(0.1 * rng.standard_normal((L, 2)), axis=0)
+        theta = step * rng.standard_normal((L, 2))
+        for _ in range(differences):
+            theta = np.cumsum(theta, axis=0)
         phi = rng.standard_normal((L, 2))
-        y = np.sum(phi * theta, axis=1) + 0.5 * rng.standard_normal(L)
-        low, high = track(Regression(2), FLS(mu=25.0), y, phi).smooth().band(0.95)
+        y = np.sum(phi * theta, axis=1) + noise * rng.standard_normal(L)
+        run = track(Regression(2), FLS(mu=(noise / step) ** 2, differences=differences), y, phi)
+        low, high = run.smooth().band(0.95)
         hits.append((low <= theta) & (theta <= high))
     assert 0.93 <= np.mean(hits) <= 0.97
 
