@@ -93,7 +93,6 @@ class NLMS(Tracker):
 
 
 def with_steps(*of: Any) -> NLMS:
-    """NLMS with steps of its own."""
     return type("NLMS", (NLMS,), {"kind": steps(*of)})()
 
 
