@@ -135,7 +135,7 @@ def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
     printed = run("verdict", *DATED)
     assert "…" not in printed
     assert "< 0.0001" in printed
-    assert "2024-03-01" in printed.split("Parameters")[1]
+    assert "2024-03-01" in printed.split("Changes")[1]
 
 
 def test_detect_scores_labels_and_writes_alarms(table):

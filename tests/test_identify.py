@@ -322,7 +322,7 @@ def test_another_process_compiles_what_is_needed_where_nothing_is_on_disk(pump, 
     assert len(draw._entries) == before  # it is what an answer calls
     monkeypatch.setattr(on_all_cores, "folder", lambda: tmp_path)
     monkeypatch.setattr(on_all_cores, "cores", lambda: 2)
-    monkeypatch.setattr(on_all_cores, "_python", lambda *_, **streams: Popen([sys.executable, "-c", ""]))
+    monkeypatch.setattr(on_all_cores, "Popen", lambda *_, **__: Popen([sys.executable, "-c", ""]))
     with on_all_cores.compiling_beside() as wait:
         assert wait() == 0
     (tmp_path / "draw-0").touch()

@@ -1,7 +1,7 @@
 """Constant parameters as samples arrive, the reference against which every run is compared: `Kalman` without drift.
 
 The start is diffuse: a parameter that the regressors have not yet determined is 0. A start with poor regressors is
-forgotten (`Linearised.settling`).
+forgotten by `RLS` (`Linearised.settling`).
 
 Of a model that is linearised at its estimates, the start is too poor for a comparison with trackers, which forget it as
 well. Its constants are fitted twice, the second time with the linearisation held where the first ended
@@ -31,6 +31,7 @@ from driftfit.run.result import Track
 from driftfit.run.track import Decisions, track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.rls import RLS
 
 STILL = Kalman(q=0.0, r=1.0)
 """Constant parameters with a diffuse start."""
@@ -38,7 +39,7 @@ STILL = Kalman(q=0.0, r=1.0)
 
 @lru_cache(64)
 def _program(model: Model) -> Program:
-    return Program(model, STILL)
+    return Program(model, RLS(1.0) if model.linearised else STILL)
 
 
 def constant_least_squares(model: Model, record: Record) -> Array:

@@ -251,7 +251,7 @@ def tune_outputs(
     gate = {key: {name: some[k].left_out for name, some in runs.items()} for k, key in enumerate(keys)}
     # lags that were missing are predictions, and those of the run are of the tracker that was found
     run: Any = run_quietly(model, trackers, y, u, reading._replace(gate=gate), data, by)
-    each = run.values() if by is not None else [run]
-    return TunedOutputs(
-        {name: replace(found, loglik=sum(one[name].loglik for one in each)) for name, found in tuned.items()}
-    )
+    logliks = dict.fromkeys(tuned, 0.0)
+    for key, found in run.items():
+        logliks[key if by is None else key[-1]] += found.loglik
+    return TunedOutputs({name: replace(found, loglik=logliks[name]) for name, found in tuned.items()})

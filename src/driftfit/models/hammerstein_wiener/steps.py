@@ -261,14 +261,10 @@ def _entering(inputs: tuple[Input, ...], i: int = 0, moves: bool = True) -> Any:
     return enter_all
 
 
-@lru_cache
-def build(s: Structure, inputs: tuple[Input, ...], out: Any, curved: bool) -> ModelSteps:
-    """The steps of a model with the kernel ``out`` of its output block; ``curved`` unless that is the identity."""
-    fill, enter = _filling(s, inputs), _entering(inputs)
-    past, minimal_past, noise_factor = _past(s), _minimal_past(s, inputs), _noise_factor(s.na)
+def _regressing(s: Structure, inputs: tuple[Input, ...], out: Any, curved: bool, fill: Any, ahead: bool) -> Any:
+    """The step that makes phi; ``fill`` prepares that of the next sample, before its input is known if ``ahead``."""
+    enter, past, minimal_past, noise_factor = _entering(inputs), _past(s), _minimal_past(s, inputs), _noise_factor(s.na)
     lay, invert, at_d, more, n = laying(out), inverting(out), s.starts[0], s.n_out - 1, s.n
-    ahead, place = min(one.nk for one in inputs) > 0, _entering(inputs, moves=False)
-    begins, widths = tuple(one.lags for one in inputs), tuple(one.n_in for one in inputs)
 
     @kernel
     def regress(s: State, l: int) -> None:
@@ -322,6 +318,16 @@ def build(s: Structure, inputs: tuple[Input, ...], out: Any, curved: bool) -> Mo
         if ahead:
             fill(s, 1, observed, l)
 
+    return regress
+
+
+@lru_cache
+def build(s: Structure, inputs: tuple[Input, ...], out: Any, curved: bool) -> ModelSteps:
+    """The steps of a model with the kernel ``out`` of its output block; ``curved`` unless that is the identity."""
+    fill, ahead, place = _filling(s, inputs), min(one.nk for one in inputs) > 0, _entering(inputs, moves=False)
+    begins, widths = tuple(one.lags for one in inputs), tuple(one.n_in for one in inputs)
+    regress = _regressing(s, inputs, out, curved, fill, ahead)
+
     @kernel
     def push(s: State, l: int) -> None:
         s.noise[l], s.y_hat[l] = s.given_noise[l], s.predicted[l]
@@ -341,7 +347,7 @@ def build(s: Structure, inputs: tuple[Input, ...], out: Any, curved: bool) -> Mo
             fill(s, 1, abs(s.y_given[l]) < LARGEST, l)
 
     oldest = max(one.nb + one.nk for one in inputs) - 1
-    foresee = partial(foreseeing, out, at_d) if curved else None
+    foresee = partial(foreseeing, out, s.starts[0]) if curved else None
     return ModelSteps(regress, push, foresee, apply if ahead else None, oldest, refuse, width=1)
 
 
