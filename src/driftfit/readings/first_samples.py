@@ -154,19 +154,18 @@ def contradicted(g: State, l: int) -> bool:
         for j in range(g.gate_fit.shape[0]):
             g.gate_fit[i, j, l] = 0.0
     spare, some, alone, more, total = 1 - g.gate_fit.shape[0], 0, 0.0, 0.0, 0.0
+    first, unexplained = -1.0, False  # doubt of the first sample that can be used
     for turn in range(2):
         for k in range(g.gate_doubt.shape[0]):
-            sure, y = turn == 0, regressed(g, k, l)
-            if (y == y) & (sure == (g.gate_doubt[k, l] == 0.0)):
+            sure, y, doubt = turn == 0, regressed(g, k, l), g.gate_doubt[k, l]
+            first = doubt if (y == y) & (first < 0.0) else first
+            unexplained |= (first < 0.0) & (doubt == 1.0)
+            if (y == y) & (sure == (doubt == 0.0)):
                 square = rotate_in(g, k, y, l)
                 spare, some = spare + (1 if sure else 0), some + (0 if sure else 1)
                 alone, more = alone + (square if sure else 0.0), more + (0.0 if sure else square)
                 total += y**2 if sure else 0.0
-    k, unexplained, last = 0, False, g.gate_doubt.shape[0] - 1
-    while (k < last) & (regressed(g, k, l) != regressed(g, k, l)):
-        unexplained |= g.gate_doubt[k, l] == 1.0
-        k += 1
-    unexplained &= g.gate_doubt[k, l] == 2.0
+    unexplained &= first == 2.0
     return (spare >= RESIDUALS) & (unexplained | (more * spare > WORSE * some * (alone + ROUNDED * total)))  # type: ignore[no-any-return]
 
 
@@ -176,15 +175,14 @@ def mark(g: State, ages: int, l: int) -> bool:
     if the others do not contradict them."""
     N, last, bit, found = g.gate_doubt.shape[0], g.gate_first.shape[1] - 1, 2.0, contradicted(g, l)
     for k in range(N):
-        g.gate_doubt[k, l] = g.gate_doubt[k, l] if found else 0.0
-        g.gate_first[k, last, l] = 1.0 if g.gate_doubt[k, l] == 1.0 else 0.0
+        g.gate_first[k, last, l] = 1.0 if found & (g.gate_doubt[k, l] == 1.0) else 0.0
     for j in range(g.gate_low.shape[0]):
         center = usual_value(g, U + j, 0.0, False, l)
         most = OUTLYING * usual_value(g, U + j, center, True, l)
         for k in range(N):
             hit = 0.0
             for later in range(k, min(k + ages + 1, N)):
-                hit = bit if g.gate_doubt[later, l] == 2.0 else hit
+                hit = bit if found & (g.gate_doubt[later, l] == 2.0) else hit
             outside = abs(g.gate_first[k, U + j, l] - center) > most
             g.gate_first[k, last, l] += hit if outside else 0.0
         bit *= 2.0
@@ -207,10 +205,9 @@ def decide(s: State, g: State, ages: int, implicit: bool) -> None:
     for l in range(g.gate_kept.shape[0]):
         judge_each(g, implicit, l)
         whole &= (dropped == 0) | (g.gate_doubt[0, l] == 1.0)
-    for l in range(g.gate_kept.shape[0]):
-        found |= mark(g, ages, l) & whole
+        found |= mark(g, ages, l)
     for l in range(s.gate_decided.shape[0]):
-        s.gate_decided[l], s.gate_replay[l] = 1, 1 + dropped if found else 0
+        s.gate_decided[l], s.gate_replay[l] = 1, 1 + dropped if found & whole else 0
 
 
 @partial(kernel, short=True)

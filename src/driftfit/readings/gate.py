@@ -109,9 +109,8 @@ def learn(s: State, l: int, g: State, k: int, seen: bool, contradicts: bool, own
     share = 1.0 / max(min(g.gate_count[k], MEMORY), 1.0)
     if seen:
         off = measured(s, l) - g.gate_mean[k]
-        if contradicts & known:
-            clip = np.sqrt(CLIPPED * spread)
-            off = min(max(off, -clip), clip)
+        clip = np.sqrt(CLIPPED * spread) if contradicts & known else np.inf
+        off = min(max(off, -clip), clip)
         g.gate_mean[k] += share * off
         g.gate_variance[k] += share * ((1.0 - share) * off * off - spread)
     if (s.ok[l] > 0.0) & (own > 0.0) & (own < np.inf):
