@@ -28,8 +28,8 @@ from driftfit.trackers.base import Tracker
 from lab.structure import ROOT, present
 
 LIMITS = {
-    "lines of the library": 66_170,
-    "statements": 42_970,
+    "lines of the library": 66_173,
+    "statements": 42_972,
     "modules": 324,
     "levels of folders": 2,
     "constants of modules with numbers": 604,
@@ -37,7 +37,7 @@ LIMITS = {
     "private names of Numba and llvmlite": 27,
     "modules that the Kalman filter imports": 24,
     "lines of them": 5_126,
-    "modules that detection imports": 92,
+    "modules that detection imports": 93,
     "modules that a second call of track passes": 9,
     "members of Tracker": 38,
     "members of Model": 26,
@@ -49,7 +49,7 @@ LIMITS = {
     "state fields of a gate": 31,
     "bytes of state of Kalman": 840,
     "bytes of state of AdaptiveKalman": 11_256,
-    "lines of tests": 33_006,
+    "lines of tests": 33_004,
 }
 """State is that of ARX(2, 2) with n = 4, fields of the model and of the driver included, without a gate."""
 
